@@ -4,7 +4,7 @@
     python examples/whole_match.py match joints.npz
 
 The steps are those of worldpose/pipeline.py. `worldpose run match` gives the same bodies, and adds
-given cameras, fractions of a frame, checks, review, reruns and lineage.
+given cameras, stills from the videos, fractions of a frame, checks, review, reruns and lineage.
 """
 
 import sys

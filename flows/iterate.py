@@ -92,7 +92,9 @@ def iterate_match(store: Store, match: Match, request: RunRequest, most: int | N
 
 def _iterate(store: Store, match: Match, request: RunRequest, most: int | None) -> Iterations:
     passes: list[Iteration] = []
-    ended = "that many were requested"
+    ended = (
+        "that many were requested" if most else f"the most iterations, {MAX_ITERATIONS}, are done"
+    )
     with shared_machines(store, request) as machines_for:
         for number in range(1, (most or MAX_ITERATIONS) + 1):
             iteration = _pass(store, match, replace(request, iteration=number), machines_for)

@@ -20,7 +20,7 @@ from typing import Any, Final
 import yaml
 from pydantic import JsonValue
 
-from data_contracts.match import MatchSpec, Registration
+from data_contracts.match import MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.settings import RunSettings
 from worldpose.body.body_file import given_body_folder
@@ -165,14 +165,19 @@ def add_venue(folder: MatchFolder, layers: Iterable[Layer]) -> MatchFolder:
     return replace(folder, spec=spec, lenses=lenses)
 
 
-def pitch_of(store: Store, registration: Registration) -> PitchSpec | None:
-    """Return the pitch of a match's folder or else of its layers; None if neither states one."""
-    spec, folder = registration.spec, Path(registration.folder)
+def pitch_of(store: Store, folder: Path, spec: MatchSpec) -> PitchSpec | None:
+    """Return the pitch of a match's folder or else of its layers; None for `pitch: none`."""
     if spec.pitch is None and not pitch_file(folder, spec):
         found = merge_general(read_layers(store, spec)).pitch
         if found is not None:
             return found
     return read_pitch(folder, spec)
+
+
+def known_pitch(store: Store, folder: Path, spec: MatchSpec) -> PitchSpec | None:
+    """Return the pitch of a match as `pitch_of`; None if the project lacks its venue."""
+    is_known = spec.venue is None or spec.venue in list_venues(store)
+    return pitch_of(store, folder, spec) if is_known else None
 
 
 def pitch_of_run(run: Run, otherwise: Callable[[], PitchSpec | None]) -> PitchSpec | None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from data_contracts.match import MatchSpec, Registration, SourceFile
-from flows.layers import pitch_of_run, read_layers
+from flows.layers import pitch_of, pitch_of_run, read_layers
 from flows.review.corrections import corrected_match
 from flows.stage import Match
 from worldpose.errors import CorruptionError, InputError
@@ -39,12 +39,13 @@ def register(
     Raises:
         InputError: the folder is not a valid match, or its id or content is already registered.
     """
-    match_id = read_spec(folder).match_id
+    spec = read_spec(folder)
+    match_id = spec.match_id
     previous = store.registration(match_id)
     with reachable(folder):
         at_home = previous is not None and previous.folder == str(folder.resolve())
     known = [file.path for file in previous.files] if previous is not None and at_home else ()
-    match_folder = read_match(folder, known)
+    match_folder = read_match(folder, known, pitch_of(store, folder, spec))
     is_next = previous is not None and previous.folder == replaces
     if replaces is not None and not is_next and not at_home:
         raise InputError(
@@ -224,12 +225,9 @@ def _read_new_files(
     def is_new(path: Path) -> bool:
         return registration.digest_of(path.relative_to(match.folder).as_posix()) not in known
 
-    def check_detections(unit: str) -> None:
-        read_unit(match, unit)
-
     with ThreadPoolExecutor(READERS) as threads:
         new = [unit for unit, path in match.detections.items() if is_new(path)]
-        for _ in threads.map(check_detections, new):
+        for _ in threads.map(lambda unit: read_unit(match, unit), new):
             pass  # an error is raised here, that of the first file
     boxes = {unit for unit, path in match.boxes.items() if is_new(path)}
     videos = {unit for unit, path in match.videos.items() if is_new(path)}

@@ -321,7 +321,7 @@ class RunLog:
         left_out = left_out_cameras(self.store, self.match, METHOD, self.plan.usable_results)
         settings, overrides = self._settings()
         state, limits = self._state(), usable_limits(self.match)
-        figures = {name: self.figures[name] for name in self._in_order()}
+        figures = {name: self.figures[name] for name in sorted(self.plan.results, key=unit_order)}
         lost = left_out_warnings(self.match, left_out, tracking.MIN_CAMERAS)
         said = {name: self.warnings[name] for name in figures}
         outcome = RunOutcome(
@@ -371,9 +371,6 @@ class RunLog:
 
             tell_lineage(self.store, record)
         return record
-
-    def _in_order(self) -> list[str]:
-        return sorted(self.plan.results, key=unit_order)
 
     def _carry_over(self) -> None:
         """Keep results of later stages that are still current, and their open questions."""

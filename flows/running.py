@@ -345,7 +345,8 @@ def _machines(
     server = prefect_server(is_local=request.dask is None)
     with end_at_once(), server as wait_until_ready, ExitStack() as stack:
         cluster: PrivateCluster | None = None
-        ask_for: Callable[[int], None] = _no_more
+        # An external cluster has a fixed number of workers.
+        ask_for: Callable[[int], None] = lambda workers: None  # noqa: E731
         if request.dask is None:
             # Entering the cluster itself would wait for its workers.
             cluster = stack.enter_context(closing(start_cluster(request.workers, missing)))
@@ -374,10 +375,6 @@ def _import_tasks(missing: Iterable[PlannedUnit]) -> None:
     tasks = task_modules(unit.recipe.stage for unit in missing)
     for name in ("prefect.flow_engine", "prefect_dask", "tasks.batch", *tasks):
         importlib.import_module(name)
-
-
-def _no_more(workers: int) -> None:
-    """Do nothing: an external cluster has a fixed number of workers."""
 
 
 @contextmanager

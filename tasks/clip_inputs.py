@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import DTypeLike, NDArray
 
-from data_contracts.arrays import ClipArray, Flags, Integers, Singles
+from data_contracts.arrays import AnyFloats, ClipArray, Flags, Integers, Singles
 from data_contracts.detection import redetection_name
 from data_contracts.keypoints import EXTRA_ARRAYS, KEYPOINT_ARRAYS, KeypointDetections
 from data_contracts.triangulation import CameraChange
@@ -219,13 +219,6 @@ class ClipInputs:
         return pitch if pitch is None or self.surface is None else pitch.with_surface(self.surface)
 
 
-NOTHING = {
-    **dict.fromkeys(("keypoints", "confidence", "boxes", "score"), np.nan),
-    "found_again": -1,
-    "shift": 0.0,
-    "rejected": False,
-}
-"""Fill values of padded detections."""
 ADJUSTED = "bundle_adjustment/cameras"
 """All static cameras after adjustment to people."""
 
@@ -247,46 +240,55 @@ def open_clip(
         redetected: include redetected people.
         further: changes of cameras within the clip besides those that earlier stages found.
     """
-    where = slice(int(inputs.frames[0]), int(inputs.frames[-1]))
-    seen = _open_cameras(inputs, where)
-    name = f"filtering/{inputs.unit}"
-    filtering = inputs.open(name).sel(frame=where) if name in inputs else None
-    feedback = StoredFeedback(
-        seen, filtering, filtered=filtered, shifted=shifted, redetected=redetected
+    detections = _open_frames(
+        inputs,
+        inputs.unit,
+        inputs.frames,
+        inputs.sources["seen"],
+        filtered=filtered,
+        shifted=shifted,
+        redetected=redetected,
+        further=further,
     )
-    correct = _view_corrector(inputs, {inputs.unit: inputs.frames}, further)
-    detections = open_detections(seen, inputs.frames, feedback, correct)
     return _open_inputs(inputs, detections)
 
 
+def _open_frames(
+    inputs: UnitInputs,
+    clip: str,
+    frame: Integers,
+    names: Sequence[str],
+    *,
+    filtered: bool = True,
+    shifted: bool = True,
+    redetected: bool = True,
+    further: Sequence[CameraChange] = (),
+) -> KeypointDetections[ClipArray]:
+    """Open rising match frames of a clip; `names` are each camera's detections."""
+    seen = [select_frames(_open_detections(inputs, name), frame) for name in names]
+    name = f"filtering/{clip}"
+    filtering = select_frames(inputs.open(name), frame) if name in inputs else None
+    feedback = StoredFeedback(
+        seen, filtering, filtered=filtered, shifted=shifted, redetected=redetected
+    )
+    return open_detections(seen, frame, feedback, _view_corrector(inputs, clip, frame, further))
+
+
 def _view_corrector(
-    inputs: UnitInputs, frames: Mapping[str, Integers], further: Sequence[CameraChange] = ()
+    inputs: UnitInputs, clip: str, frame: Integers, further: Sequence[CameraChange]
 ) -> Callable[[Singles, slice], Singles] | None:
     """Return the correction of cameras whose view changes; None if all stay as they are.
 
-    Rows are the match frames of one clip after the other. Clips may overlap in time: each is
-    corrected by the changes that were found in it, and all by `further`.
+    Clips may overlap in time: each is corrected by the changes that were found in it, and all by
+    `further`. Rows are match frames `frame`.
     """
-    views = [
-        [each for each in (*known_changes(inputs, clip), *further) if each.kind == "view"]
-        for clip in frames
-    ]
-    if not any(views):
+    views = [each for each in (*known_changes(inputs, clip), *further) if each.kind == "view"]
+    if not views:
         return None
-    frame = np.concatenate(list(frames.values()))
-    clip_of = np.repeat(np.arange(len(frames)), [len(each) for each in frames.values()])
     names = tuple(inputs.sources["cameras"])
     cameras, _, _ = _load_cameras(inputs, names)
     known = {name: cameras[c] for c, name in enumerate(names)}
-
-    def correct(page: Singles, rows: slice) -> Singles:
-        out = page.copy()
-        for clip, own in enumerate(views):
-            here = clip_of[rows] == clip
-            out[here] = correct_views(page[here], frame[rows][here], known, own)
-        return out
-
-    return correct
+    return lambda page, rows: correct_views(page, frame[rows], known, views).astype(page.dtype)
 
 
 def known_changes(inputs: UnitInputs, clip: str) -> list[CameraChange]:
@@ -302,22 +304,26 @@ def open_tracked_clip(
     *,
     filtered: bool = True,
     shifted: bool = True,
+    redetected: bool = True,
     further: Sequence[CameraChange] = (),
 ) -> ClipInputs:
     """Open the unit's clip with its tracked people that are triangulated; as `open_clip`."""
-    clip = open_clip(inputs, filtered=filtered, shifted=shifted, further=further)
+    clip = open_clip(
+        inputs, filtered=filtered, shifted=shifted, redetected=redetected, further=further
+    )
     tracks = select_triangulated(inputs.open(f"tracking/{inputs.unit}"))
     people = clip.detections.assign_people(tracks["detection_index"].values)
-    if "clocks" in inputs.sources:
-        clocks = [remaining_offset(inputs.frames, *clock) for clock in inputs.sources["clocks"]]
-        people = _on_match_clock(people, np.stack(clocks, axis=1))
-    return replace(clip, detections=people, person=tracks["person"].values)
+    return replace(clip, detections=_on_match_clock(inputs, people), person=tracks["person"].values)
 
 
 def _on_match_clock(
-    people: KeypointDetections[ClipArray], late: NDArray[np.float64]
+    inputs: UnitInputs, people: KeypointDetections[ClipArray]
 ) -> KeypointDetections[ClipArray]:
-    """Return tracked people at match time, read on access; `late` is (frames, cameras)."""
+    """Return tracked people of consecutive frames at match time, read on access."""
+    if "clocks" not in inputs.sources:
+        return people
+    clocks = [remaining_offset(people.frame, *clock) for clock in inputs.sources["clocks"]]
+    late = np.stack(clocks, axis=1)
 
     def correct(array: ClipArray) -> PagedArray:
         def read(rows: slice) -> NDArray[np.float64]:
@@ -366,53 +372,43 @@ def load_dropped_boxes(inputs: UnitInputs) -> Flags | None:
         return None
     dropped = inputs.open(before)["dropped"]
     frame = dropped["frame"].values
-    seen = _open_cameras(inputs, slice(frame[0], frame[-1]))
+    seen = [select_frames(_open_detections(inputs, n), frame) for n in inputs.sources["seen"]]
     return align_results(dropped.values, mark_redetected(seen, slice(None)))
 
 
 def open_frames(inputs: UnitInputs, frames: Mapping[str, NDArray[np.int64]]) -> ClipInputs:
-    """Open selected match frames of each clip, with every camera's detections in memory."""
-    names = inputs.sources["seen"]
-    seen = [
-        _concatenate_clips(
-            [
-                select_frames(_open_detections(inputs, names[clip][c]), frames[clip])
-                for clip in frames
-            ]
-        )
-        for c in range(len(inputs.sources["cameras"]))
-    ]
-    filtering = [
-        inputs.open(name)[["rejected", "shift"]].sel(frame=frame)
-        for clip, frame in frames.items()
-        if (name := f"filtering/{clip}") in inputs
-    ]
-    feedback = StoredFeedback(seen, _concatenate_clips(filtering) if filtering else None)
-    frame = np.concatenate(list(frames.values()))
-    correct = _view_corrector(inputs, frames)
-    detections = open_detections(seen, frame, feedback, correct)
-    return _open_inputs(inputs, detections[: len(frame)])
+    """Open selected match frames of each clip in memory, with tracked people at match time."""
+    parts = []
+    for clip, frame in frames.items():
+        read, names = frame, inputs.sources["seen"][clip]
+        if "clocks" in inputs.sources:  # people move between neighbouring frames
+            first, count = inputs.sources["clips"][clip]
+            read = np.arange(first, first + count)
+        found = _open_frames(inputs, clip, read, names)
+        if "clocks" in inputs.sources:
+            tracks = select_triangulated(inputs.open(f"tracking/{clip}"))
+            found = found.assign_people(tracks["detection_index"].values)
+            found = _on_match_clock(inputs, found)
+        bare = replace(found, points=(), extra_keypoints=None, extra_confidence=None)
+        parts.append(bare[np.searchsorted(read, frame)].arrays())
+    most = max(part["score"].shape[2] for part in parts)
+    arrays: dict[str, Any] = {
+        name: np.concatenate([_pad_detections(part[name], most) for part in parts])
+        for name in parts[0]
+    }
+    detections = KeypointDetections(**arrays, frame=np.concatenate(list(frames.values())))
+    return _open_inputs(inputs, detections)
 
 
-def _open_cameras(inputs: UnitInputs, where: slice) -> list[xr.Dataset]:
-    """Return each camera's detections in the unit's clip."""
-    return [_open_detections(inputs, name).sel(frame=where) for name in inputs.sources["seen"]]
+def _pad_detections(array: AnyFloats, most: int) -> AnyFloats:
+    """Return an array (frames, cameras, detections, ...) with NaN for detections up to `most`."""
+    more = [(0, 0), (0, 0), (0, most - array.shape[2]), *[(0, 0)] * (array.ndim - 3)]
+    return np.pad(array, more, constant_values=np.nan)
 
 
 def _open_detections(inputs: UnitInputs, name: str) -> xr.Dataset:
     """Return a camera's detections, with redetected people if they are an input."""
     return inputs.open_first(redetection_name(name) or name, name)
-
-
-def _concatenate_clips(clips: Sequence[xr.Dataset]) -> xr.Dataset:
-    """Concatenate one camera's detections over clips, padded to the same number."""
-    most = max(clip.sizes["detection"] for clip in clips)
-    padded = []
-    for clip in clips:
-        names = [each for each in NOTHING if each in clip]
-        more = (0, most - clip.sizes["detection"])
-        padded.append(clip[names].pad(detection=more, constant_values=NOTHING))
-    return xr.concat(padded, dim="frame")
 
 
 def _open_inputs(inputs: UnitInputs, detections: KeypointDetections[ClipArray]) -> ClipInputs:

@@ -23,7 +23,6 @@ from tasks.clip_inputs import (
     ClipInputs,
     PagedArray,
     load_dropped_boxes,
-    open_clip,
     open_tracked_clip,
     triangulation_settings,
 )
@@ -63,6 +62,7 @@ from worldpose.filtering.systematic_errors import (
     watch_motion,
 )
 from worldpose.geometry.cameras import Camera, camera_from_arrays
+from worldpose.ingest.clock import remaining_offset
 from worldpose.review.identities import select_triangulated
 from worldpose.store.writer import ResultWriter
 from worldpose.triangulation.settings import TriangulationSettings
@@ -290,11 +290,10 @@ def _held_out(
         frames: the frames to measure in.
         suspects: their detections.
     """
-    used = suspects.detections
-    keypoints = used.keypoints
+    used, keypoints = suspects.detections, suspects.detections.keypoints
     if not case.first:
         used = open_tracked_clip(inputs).detections[frames]
-        whole = open_clip(inputs, filtered=False, redetected=False)
+        whole = open_tracked_clip(inputs, filtered=False, redetected=False)
         keypoints = whole.detections.keypoints[frames]
     found = measure_held_out(case.clip.cameras, used, keypoints, case.triangulation)
     if found is None:
@@ -385,9 +384,13 @@ def _open_view(inputs: UnitInputs) -> _CameraCase:
     systematic = SystematicErrors(
         ViewBias(said["view_bias"].values), said["clock_late"].values[[place]]
     )
-    shift = systematic.shift(watch_motion(one, joints, step), views)
+    motion = watch_motion(one, joints, step)
+    shift = systematic.shift(motion, views)
     offsets = placed["offsets"].values.astype(np.float64)
-    beside = shift[:, 0] + offsets[:, 0, :, None]
+    clocks = inputs.made_from(f"tracking/{clip}").sources.get("clocks")
+    late = np.zeros(1) if clocks is None else remaining_offset(detected.frame, *clocks[place])
+    in_image = shift + late[:, None, None, None, None] * motion.image_motion
+    beside = in_image[:, 0] + offsets[:, 0, :, None]
 
     count = detected.score.shape[1]  # indices from here on: earlier redetections
     index = tracks["detection_index"].values[:, place]
@@ -416,7 +419,7 @@ def _open_view(inputs: UnitInputs) -> _CameraCase:
         expected=Expected.of(views, beside, float(camera.focal.mean())),
         shift=np.nan_to_num(shift[:, 0]),
         seen=seen,
-        spread=_spread(views, suspects.subtract(shift)),
+        spread=_spread(views, suspects.subtract(in_image)),
         noise=noise,
     )
 
@@ -454,10 +457,7 @@ def _search(inputs: UnitInputs, case: _CameraCase, sought: MissingPeople) -> Key
 def _pictures(
     inputs: UnitInputs, case: _CameraCase, places: NDArray[np.int64]
 ) -> Iterator[tuple[int, Image | None]]:
-    """Yield the images of some frame indices, as the video has them, without those it lacks.
-
-    Decoding skips images without a search.
-    """
+    """Yield the images of some frame indices, as the video has them, without those it lacks."""
     footage = inputs.open(f"ingest/{inputs.sources['camera']}")
     numbers = footage["picture_of_frame"].sel(frame=case.detected.frame[places]).values
     there = numbers >= 0

@@ -26,7 +26,7 @@ from tasks.body_fitting import (
 from tasks.broadcast_calibration import BroadcastInputs, image_clock, open_broadcast
 from tasks.clip_inputs import select_frames
 from tasks.unit import UnitInputs, figures_of, unit_task
-from worldpose.body_fitting.bones import Shape, pool_shapes
+from worldpose.body_fitting.bones import Shape, agree, pool_shapes
 from worldpose.body_fitting.monocular import (
     MonocularEstimates,
     MonocularPoses,
@@ -72,8 +72,7 @@ def _refit(inputs: UnitInputs, result: ResultWriter) -> None:
     names = sorted(name for name in inputs.recipe.inputs if name.startswith(stage))
     views = [_RefittedView.open(inputs, name.removeprefix(stage), fitted) for name in names]
     people = open_people(inputs, views)
-    weight = before.settings(BodyFittingSettings).shape_weight
-    known = _known_shapes(inputs, people.person, weight)
+    known = _known_shapes(inputs, before, fitted, result)
     pooled = np.isin(np.arange(len(people.person)), list(known))
     recognised = 0
     moved: list[list[Floats]] = [[] for _ in people.person]
@@ -168,29 +167,59 @@ class _RefittedView:
 
 
 def _known_shapes(
-    inputs: UnitInputs, persons: NDArray[np.integer], weight: float
+    inputs: UnitInputs, before: UnitInputs, fitted: xr.Dataset, result: ResultWriter
 ) -> dict[int, Shape]:
-    """Return the body shapes from other clips, by person index.
+    """Return the body shapes from other clips that can be the same person's, by person index.
 
     Args:
         inputs: the unit.
-        persons: ids of this clip's people.
-        weight: weight of the betas' normal prior, common to the bodies of all clips [1].
+        before: what `fitted` was computed from.
+        fitted: bodies of this clip.
+        result: gets a warning of every name without a person, or of different people.
     """
     named: dict[str, dict[str, str]] = dict(inputs.sources["people"])
-    here = named.pop(inputs.unit)
-    shapes: dict[str, list[Shape]] = {}
-    for clip, people in named.items():
-        found = inputs.open(f"body_fitting/{clip}")
-        for place, person in enumerate(found["person"].values):
-            betas = found["betas"].values[place]
-            if str(person) in people and np.isfinite(betas).all():
-                shape = Shape(betas, found["betas_covariance"].values[place])
-                shapes.setdefault(people[str(person)], []).append(shape)
+    here, own = named.pop(inputs.unit), _fitted_shapes(fitted)
+    others = {clip: _fitted_shapes(inputs.open(f"body_fitting/{clip}")) for clip in named}
+    model, weight = find_same_body(before), before.settings(BodyFittingSettings).shape_weight
+
+    def stature(shape: Shape) -> str:
+        height = model.template[:, 1] + model.shape_directions[:, 1] @ shape.betas
+        return f"{np.ptp(height):.2f} m"
+
+    known, ids = {}, fitted["person"].values.tolist()
+    for person, name in here.items():
+        if int(person) not in ids:
+            result.warnings.append(
+                f"clip {inputs.unit} has no fitted person {person}, named {name}; its people are "
+                f"{', '.join(map(str, ids)) or 'none'}. Correct the clip's `people` in match.yaml."
+            )
+            continue
+        shapes = []
+        for clip, people in named.items():
+            for other, shape in others[clip].items():
+                if people.get(other) != name:
+                    continue
+                if person not in own or agree(own[person], shape):
+                    shapes.append(shape)
+                elif inputs.unit < clip:  # once for both
+                    result.warnings.append(
+                        f"person {person} of clip {inputs.unit} and person {other} of clip {clip} "
+                        f"are both named {name} and differ: their bodies are "
+                        f"{stature(own[person])} and {stature(shape)} tall. Neither gets the "
+                        "other's shape: correct `people` in match.yaml."
+                    )
+        if shapes:
+            known[ids.index(int(person))] = pool_shapes(shapes, weight)
+    return known
+
+
+def _fitted_shapes(bodies: xr.Dataset) -> dict[str, Shape]:
+    """Return the known shapes of fitted bodies by person."""
+    rows = bodies["person"].values, bodies["betas"].values, bodies["betas_covariance"].values
     return {
-        place: pool_shapes(shapes[here[str(person)]], weight)
-        for place, person in enumerate(persons)
-        if here.get(str(person)) in shapes
+        str(person): Shape(betas, covariance)
+        for person, betas, covariance in zip(*rows, strict=True)
+        if np.isfinite(betas).all()
     }
 
 

@@ -1,8 +1,8 @@
 """Matches of which there is nothing but small videos."""
 
 import numpy as np
+from run_records import calibration
 
-from data_contracts.cameras import CameraCalibration
 from data_contracts.match import MatchSpec
 from worldpose.ingest.writing import write_match
 from worldpose.video.files import write_video
@@ -37,13 +37,10 @@ def write_filmed(folder, greys, clips, *, offsets=None):
         "pitch": "none",
     }
     calibrations = {
-        name: CameraCalibration(
-            id=name,
-            image_size=SIZE,
-            focal_px=(50.0, 50.0),
-            principal_point_px=(31.5, 23.5),
-            rotation=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-            translation=(0.01 * n, 0.0, 5.0),
+        name: calibration(
+            name,
+            **{"image_size": SIZE, "focal_px": (50.0, 50.0), "principal_point_px": (31.5, 23.5)},
+            **{"rotation": np.eye(3).tolist(), "translation": (0.01 * n, 0.0, 5.0)},
         )
         for n, name in enumerate(greys)
     }

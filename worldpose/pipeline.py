@@ -104,7 +104,8 @@ def calibrate_static_cameras(match: MatchFolder, pitch: PitchTemplate) -> list[S
             raise InputError(str(match.folder / "annotations"), expected, "none", todo)
         size, still = (spec.width, spec.height), match.stills.get(spec.id)
         picture = None if still is None else read_still(still, size)
-        calibrations.append(calibrate_camera(pitch, match.clicked[spec.id], size, picture=picture))
+        clicks, lens = match.clicked[spec.id], match.lenses.get(spec.id)
+        calibrations.append(calibrate_camera(pitch, clicks, size, picture=picture, lens=lens))
     return calibrations
 
 

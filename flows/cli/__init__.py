@@ -34,20 +34,17 @@ def main() -> None:
         except (MemoryError, RuntimeError, OSError) as failure:
             require_memory(failure)
             raise
-    except (OSError, WorldposeError) as error:
-        message = str(error)
+    except Exception as error:
+        kind, message = type(error).__name__, str(error)
         if isinstance(error, OSError):
             message = f"{error.filename or 'a file'}: {error.strerror or error}"
+        elif not isinstance(error, WorldposeError):
+            kind = "InternalError"
+            message = f"{InternalError.wrap('worldpose', error)} All of it: {_kept_trace()}"
         if "--json" in sys.argv:
-            print(json.dumps({"error": type(error).__name__, "message": message}))  # noqa: T201
+            print(json.dumps({"error": kind, "message": message}))  # noqa: T201
         line(f"error: {message}", to=errors)
         sys.exit(2 if isinstance(error, UsageError) else 1)
-    except Exception as error:
-        message = f"{InternalError.wrap('worldpose', error)} All of it: {_kept_trace()}"
-        if "--json" in sys.argv:
-            print(json.dumps({"error": "InternalError", "message": message}))  # noqa: T201
-        line(f"error: {message}", to=errors)
-        sys.exit(1)
     finally:
         gc.freeze()  # the process ends: freeing all its modules one by one takes half a second
 

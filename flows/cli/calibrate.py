@@ -197,6 +197,7 @@ def _as_json(fit: LensFit) -> dict[str, object]:
         "lens": fit.lens.model_dump(mode="json"),
         "rms_px": fit.rms_px,
         "coverage": fit.coverage,
+        "bend_m": fit.bend_m,
         "images": int(fit.used.sum()),
         "left_out": {str(n): reason for n, reason in enumerate(fit.reasons) if reason},
     }
@@ -222,6 +223,12 @@ def _print(fits: dict[str, LensFit], files: dict[str, list[str]]) -> None:
         for file, reason in zip(files[name], fit.reasons, strict=True):
             if reason:
                 line(f"{name}: {file} is left out: {reason}")
+        if fit.bend_m > 0.0:
+            line(
+                f"{name}: the board is bent by {1000.0 * fit.bend_m:.1f} mm, and deviations are "
+                "larger by what that moves the lens: fix it to a flat plate, and film it again",
+                to=errors,
+            )
         if fit.coverage < FEW_FIELDS:
             line(
                 f"{name}: only {100 * fit.coverage:.0f} % of the image have corners: distortion "

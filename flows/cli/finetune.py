@@ -23,13 +23,6 @@ SETTING = {"people": "detection.detector", "keypoints": "detection.pose"}
 """Setting that selects each net in a run."""
 
 
-class _Lines(logging.Handler):
-    """Log handler that prints training progress."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        console.line(record.getMessage(), to=console.errors)
-
-
 def label(
     videos: Annotated[list[Path], typer.Argument(metavar="VIDEO...")],
     out: Path,
@@ -90,7 +83,7 @@ def finetune(
     settings = _settings(assignments or [])
     logger = logging.getLogger("worldpose.finetune")
     logger.setLevel(logging.INFO)
-    shown = _Lines()
+    shown = logging.StreamHandler()
     logger.addHandler(shown)
     try:
         with prefect_server() as wait_until_ready:

@@ -29,6 +29,7 @@ from worldpose.bundle_adjustment.people_cameras import locate_cameras as estimat
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.formats.files import whole_file
+from worldpose.formats.lens_files import square_focal
 from worldpose.ingest.match_folder import LENS_FILE
 from worldpose.store.store import Run, Store
 
@@ -121,7 +122,9 @@ def _lens(match: Match, camera: str) -> LensCalibration:
         return folder.lenses[camera]
     if camera in folder.calibrations:
         given = folder.calibrations[camera]
-        focal = float(np.mean(given.focal_px))
+        focal, differ = square_focal(
+            given.focal_px, f"{folder.folder / 'calibration.toml'}: {camera}"
+        )
         return LensCalibration(
             id=camera,
             image_size=given.image_size,
@@ -129,7 +132,7 @@ def _lens(match: Match, camera: str) -> LensCalibration:
             principal_point_px=given.principal_point_px,
             distortion=given.distortion,
             lens_model=given.lens_model,
-            focal_std_px=GIVEN_FOCAL * focal,
+            focal_std_px=max(GIVEN_FOCAL * focal, differ),
             principal_point_std_px=GIVEN_CENTER_PX,
             distortion_std=0.005,
         )

@@ -14,13 +14,14 @@ from data_contracts.match import MatchSpec
 from data_contracts.pitch import TemplateName
 from flows.cli.console import answer, errors, line, print_json, print_table
 from flows.cli.options import DEFAULT_PROJECT, given_options
+from flows.layers import known_pitch
 from flows.registering import register
 from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.ingest.camera_data import import_camera_data
 from worldpose.ingest.clicks import import_clicks
 from worldpose.ingest.importing import import_lenses, import_match, import_videos
-from worldpose.ingest.match_folder import unclicked_clips
+from worldpose.ingest.match_folder import read_spec, unclicked_clips
 from worldpose.ingest.pose2sim import import_pose2sim
 from worldpose.ingest.writing import import_boxes
 from worldpose.store.store import Store
@@ -49,6 +50,7 @@ def import_command(
     template: TemplateName | None = None,
     unit: str | None = None,
     up: str | None = None,
+    project: str = DEFAULT_PROJECT,
 ) -> None:
     """Import calibration and 2D poses or videos, boxes, clicks, lenses or a pitch into a folder.
 
@@ -91,7 +93,7 @@ def import_command(
         up: Axis of the calibration's world that points up: x, -x, y, -y, z, -z, or three numbers.
             By default people who stand tell it.
     """
-    given = set(given_options(import_command, locals()))
+    given = set(given_options(import_command, locals())) - {"--project"}
     if videos is not None:  # then they are a part of the match
         given -= {"--boxes", "--join"}
     kind = next((name for name in ALONE if name in given), None)
@@ -111,7 +113,7 @@ def import_command(
     elif kind == "--lens" and lens is not None:
         _import_lenses(lens, out, camera)
     elif kind == "--clicks" and clicks is not None:
-        _import_clicks(clicks, out, camera)
+        _import_clicks(clicks, out, camera, Store.open_or_new(project))
     elif kind == "--camera-data" and camera_data is not None:
         target, data = import_camera_data(
             camera_data, out, camera, first=first_frame, number=freed_camera, zoom_table=zoom_table
@@ -237,9 +239,9 @@ def _import_lenses(files: list[Path], out: Path, camera: str | None) -> None:
         )
 
 
-def _import_clicks(file: Path, out: Path, camera: str | None) -> None:
+def _import_clicks(file: Path, out: Path, camera: str | None, store: Store) -> None:
     """Write clicks and own points into a match folder, and print what was read."""
-    found = import_clicks(file, out, camera)
+    found = import_clicks(file, out, camera, known_pitch(store, out, read_spec(out)))
     questions = []
     if found.repeated:
         from flows.review.repeated_clicks import explain_repeated  # late: it loads the estimators

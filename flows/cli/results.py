@@ -183,7 +183,7 @@ def report(
     opened = open_results(store, known.match_id, run).record
     if run == LATEST and (later := describe_age(store, opened)):
         line(later, to=errors)
-    films = write_report(
+    films, unscored = write_report(
         store,
         known,
         out,
@@ -193,6 +193,8 @@ def report(
         camera=camera,
         figures=figures,
     )
+    if unscored:
+        line(f"warning: {unscored}", to=errors)
     written_files = {file.name: None for file in (out, *films)}
     record_owner(out.parent, written_files, known.match_id)
     if figures is not None:

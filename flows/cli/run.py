@@ -22,6 +22,7 @@ from flows.reprocess import Reprocessed, State, reprocess_matches
 from flows.results.automatic_exports import export_after_run
 from flows.review.advice import click_advice, clock_advice
 from flows.review.corrections import objections_of
+from flows.review.identities import lost_names
 from flows.review.metric_words import all_reasons
 from flows.review.verdicts import warnings_of
 from flows.run_record import alone_with
@@ -110,7 +111,7 @@ def run(
     seconds = time.monotonic() - started
     warned = [
         *record.warnings,
-        *objections_of(Run(store, record)).values(),
+        *(objections_of(run := Run(store, record)) | lost_names(run)).values(),
         *clock_advice(record.figures, opened.folder.spec),
         *click_advice(record.figures, record.settings),
     ]

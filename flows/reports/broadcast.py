@@ -15,7 +15,6 @@ from flows.reports.match_pictures import shown_pitch
 from flows.results.best_results import body_tracks, clip_title, joint_tracks
 from flows.results.run_cameras import broadcast_cameras, broadcast_unit, clip_of
 from flows.stage import Match
-from flows.stages.detection import seen_in_broadcast
 from worldpose.broadcast_calibration.given_camera import GivenCamera
 from worldpose.broadcast_calibration.report import camera_before
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
@@ -79,7 +78,7 @@ def broadcast_pictures(run: Run, match: Match, clip: str | None = None) -> list[
             # An image between two match frames has no camera: the nearest one that has is drawn.
             place = clock.nearest_frame(video_number)
             number, video_number = int(frame[place]), int(clock.number[place])
-            (still,) = _pictures(match, view, frame[[place]])
+            still = _picture(match, view, number)
             pictures.append(
                 CaptionedImage(
                     f"{clip_title(view)}, frame {number}, {video_number} of its video, among those "
@@ -125,8 +124,7 @@ def _before_and_after(
     shared = JointTracks(both, tracks.person_ids, joints)
     place, person = largest_pose_changes(before, after, shared)
     number = int(both[place])
-    (detected,) = seen_in_broadcast(match, view)
-    (still,) = _pictures(match, view, frame[frame == number])
+    (detected,) = _seen_in(run, view)
     markings, players = (
         "{:.2f} and {:.2f}".format(*result.attrs[name]) for name in ("markings_off", "players_off")
     )
@@ -141,12 +139,24 @@ def _before_and_after(
                 shared,
                 place,
                 person,
-                still=still,
+                still=_picture(match, view, number),
                 seen=run[detected].sel(frame=number)["keypoints"].values,
                 pitch=shown_pitch(run, match, view),
             ),
         )
     ]
+
+
+def _seen_in(run: Run, view: str) -> list[str]:
+    """Return the result of a run with a view's detections; its video may be gone since."""
+    names = f"detection/{view}", f"ingest/{view}"
+    return [name for name in names if name in run and "boxes" in run[name]][:1]
+
+
+def _picture(match: Match, view: str, frame: int) -> Image | None:
+    """Return a view's image as `_pictures` yields it; None if its video is gone."""
+    there = view in match.folder.videos
+    return next(_pictures(match, view, np.array([frame]))) if there else None
 
 
 def _pictures(match: Match, view: str, frames: Integers) -> Iterator[Image]:
@@ -258,8 +268,10 @@ def _numbers(values: list[float]) -> str:
 def flow_pictures(run: Run, match: Match, view: str, camera: Camera) -> list[CaptionedImage]:
     """Draw points tracked between the two frames with the largest rotation of the camera.
 
-    The camera is a batch over the frames of its clip.
+    The camera is a batch over the frames of its clip; nothing without the video.
     """
+    if view not in match.folder.videos:
+        return []
     frames = run[f"broadcast_calibration/{view}"]["frame"].values
     rotation = camera.cam_from_world.rotation
     # The angle of R1^T R2 increases as the trace decreases.
@@ -271,7 +283,7 @@ def flow_pictures(run: Run, match: Match, view: str, camera: Camera) -> list[Cap
     number = int(frames[pair])
     stills = list(_pictures(match, view, frames[pair : pair + 2]))
     boxes = None
-    for unit in seen_in_broadcast(match, view):
+    for unit in _seen_in(run, view):
         boxes = run[unit]["boxes"].sel(frame=[number]).values.astype(np.float64)
     own = run.record.settings.get("broadcast_calibration", {})
     settings = BroadcastCalibrationSettings.model_validate(own)

@@ -27,8 +27,9 @@ from worldpose.video.files import write_video
 def clip_view(run: Run, match: Match, clip: str) -> str | None:
     """Return the source of a clip's video: a broadcast camera, else a static camera.
 
-    Of several it is the one with most people; None if no camera has a video.
+    Of several it is the one with most people; None if no camera has a video that is at hand.
     """
+    match = match.at_hand()
     views = [view for view in broadcast_views(run, clip) if view in match.folder.videos]
     if not views:
         return static_view(run, match, clip)
@@ -36,12 +37,12 @@ def clip_view(run: Run, match: Match, clip: str) -> str | None:
 
 
 def static_view(run: Run, match: Match, clip: str) -> str | None:
-    """Return the static camera with a video and most people in a clip; None if none has a video."""
+    """Return the camera with most people in a clip of those with a video at hand; None if none."""
     if not match.has_static_cameras:
         return None
     seen = placed_joints(run, clip)["inliers"].any("joint").sum(("frame", "person")).values
     order = [list(static_cameras(run, match.folder.spec))[c] for c in np.argsort(-seen)]
-    return next((camera for camera in order if camera in match.folder.videos), None)
+    return next((camera for camera in order if camera in match.at_hand().folder.videos), None)
 
 
 def write_clip_video(

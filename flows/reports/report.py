@@ -40,11 +40,12 @@ from flows.results.run_cameras import BROADCAST, broadcast_cameras, broadcast_vi
 from flows.review.descriptions import in_words, is_first_click, when
 from flows.stage import Match
 from worldpose.dataset.statistics import clip_statistics, data_set_statistics, kind_of, most_moving
-from worldpose.errors import UsageError
+from worldpose.errors import UsageError, WorldposeError
 from worldpose.formats.files import whole_file
+from worldpose.formats.joints_file import JointTracks
 from worldpose.reports.data_set import counted_section
 from worldpose.reports.drawing import keep_figures, write_figure
-from worldpose.reports.html_page import CaptionedImage, LinkedFile, Section, Table
+from worldpose.reports.html_page import CaptionedImage, Failure, LinkedFile, Section, Table
 from worldpose.reports.run_report import report_page
 from worldpose.store.store import Run, Store
 
@@ -65,12 +66,15 @@ def write_report(
     videos: bool = True,
     camera: str | None = None,
     figures: Path | None = None,
-) -> list[Path]:
-    """Write the HTML report of one run, and return the videos written next to it.
+) -> tuple[list[Path], str]:
+    """Write the HTML report of one run.
 
     The reference is ground truth; None = `reference/` of the match folder, if it exists. Videos are
     each clip's broadcast video, and that of a static camera (None = the one with most people), with
     the results overlaid. `figures` is a folder for the page's figures as SVG, PDF and JSON.
+
+    Returns:
+        The videos written next to it; and why a reference is not scored, empty if it is.
 
     Raises:
         UsageError: there is no such static camera with a video.
@@ -78,23 +82,20 @@ def write_report(
     if out.is_dir():
         todo = f"Name a file in it, as in --out {out / 'report.html'}."
         raise UsageError(f"--out {out}", expected="a file", found="a folder", todo=todo)
+    match = match.at_hand()
     if camera is not None:
         _check_film(match, camera)
-    match = match.at_hand()
     run = open_results(store, match.match_id, run_id)
     if not any(unit.startswith(("static_calibration/", BROADCAST)) for unit in run):
         clips_of(run.record)  # without cameras, there have to be people
-    source = reference or _own_reference(match)
-    scores: Evaluation | None = None
-    if source is not None and len(find_clips(run.record)) == 1:
-        scores = score(match.match_id, source, store.url, run_id=run.record.run_id).evaluation
+    scores, truth, unscored = _against_truth(store, run, match, reference)
     _load_late_modules(run)
     with ThreadPoolExecutor(1) as painter:
         # Painting and encoding leave the interpreter to the figures for much of their time.
         filming = painter.submit(_write_videos, store, run, match, out, camera) if videos else None
         try:
             with nullcontext(None) if figures is None else keep_figures() as kept:
-                first, *others = _sections(store, run, match, source)
+                first, *others = _sections(store, run, match, truth)
         except BaseException:
             for film in [] if filming is None else filming.result():
                 film.unlink()  # without its page, the next report would take it for another's
@@ -106,6 +107,8 @@ def write_report(
         tuple(beside),
         "With markings and people drawn over them, in the folder of this page.",
     )
+    if unscored:
+        others.append(Section("Against the truth", (Table("", ("",), ((Failure(unscored),),)),)))
     if figures is not None and kept is not None:
         _write_figures([first, *others], kept, figures)
     page = report_page(
@@ -118,7 +121,7 @@ def write_report(
     )
     with whole_file(out) as draft:
         draft.write_text(page, encoding="utf-8")
-    return films
+    return films, unscored
 
 
 def _load_late_modules(run: Run) -> None:
@@ -162,7 +165,7 @@ def _write_videos(
     store: Store, run: Run, match: Match, out: Path, camera: str | None
 ) -> list[Path]:
     films = []
-    for view in broadcast_views(run):
+    for view in (it for it in broadcast_views(run) if it in match.folder.videos):
         from flows.reports.broadcast import write_broadcast_video  # late: it imports estimators
 
         films.append(out.with_name(f"{out.stem}-{view}.mp4"))
@@ -176,11 +179,10 @@ def _write_videos(
     return films
 
 
-def _sections(store: Store, run: Run, match: Match, reference: str | None) -> list[Section]:
+def _sections(store: Store, run: Run, match: Match, truth: JointTracks | None) -> list[Section]:
     """Return all sections of the report, in the order of a reader's questions."""
     clips = find_clips(run.record)
     filmed = clips if match.has_static_cameras else ()
-    truth = None if reference is None else load_reference(reference)
     cameras = static_cameras(run, match.folder.spec)
     viewer, left_out = report_viewer(run, match)
     return [
@@ -238,9 +240,30 @@ def _broadcast_blocks(run: Run, match: Match) -> list[CaptionedImage | Table]:
     return [*broadcast_pictures(run, match), *broadcast_tables(run, match)]
 
 
-def _own_reference(match: Match) -> str | None:
-    folder = match.folder.folder / "reference"
-    return str(folder) if (folder / "joints.npz").is_file() else None
+def _against_truth(
+    store: Store, run: Run, match: Match, reference: str | None
+) -> tuple[Evaluation | None, JointTracks | None, str]:
+    """Return scores, true joints, and why there are no scores in spite of a reference.
+
+    A report does not fail for a reference of the match folder: nobody asked for it.
+    """
+    own, clips = match.folder.folder / "reference", find_clips(run.record)
+    source = reference or (str(own) if (own / "joints.npz").is_file() else None)
+    if source is None:
+        return None, None, ""
+    truth = None
+    try:
+        truth = load_reference(source)
+        if len(clips) == 1:
+            scores = score(match.match_id, source, store.url, run_id=run.record.run_id)
+            return scores.evaluation, truth, ""
+    except WorldposeError as error:
+        if reference is not None:
+            raise
+        return None, truth, f"The results are not scored against {source}: {error}"
+    found = f"the run has {len(clips)} clips with people, and a reference is of one"
+    todo = "Export the match, and evaluate clip by clip."
+    return None, truth, f"The results are not scored against {source}: {found}. {todo}"
 
 
 def extent_of(run: Run, match: Match) -> DataSetStatistics:

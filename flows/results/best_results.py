@@ -380,7 +380,8 @@ class Origin:
     @property
     def pitch(self) -> PitchSpec | None:
         """Return the pitch of the run; None without one."""
-        return pitch_of_run(self.run, lambda: pitch_of(self.run.store, self.registration))
+        folder = Path(self.registration.folder)
+        return pitch_of_run(self.run, lambda: pitch_of(self.run.store, folder, self.spec))
 
     def tracks(self, clip: str) -> JointTracks:
         """Return the joints of one clip."""

@@ -30,7 +30,8 @@ from worldpose.evaluation.position_reference import align_positions
 from worldpose.formats.joints_file import JointTracks, read_joints
 from worldpose.formats.release_cameras import read_camera
 from worldpose.geometry.cameras import Camera
-from worldpose.ingest.match_folder import MatchFolder, read_match
+from worldpose.ingest.match_folder import MatchFolder, read_spec
+from worldpose.ingest.pitch_file import read_pitch
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.runs import LATEST
 from worldpose.store.store import Store
@@ -201,7 +202,10 @@ def reference_side(name: str) -> Side:
     """
     path = Path(name)
     above = [folder for folder in path.resolve().parents[:2] if (folder / "match.yaml").is_file()]
-    match = read_match(above[0]) if above else None
+    match = None
+    if above:  # without its videos, which may be gone
+        spec = read_spec(above[0])
+        match = MatchFolder(above[0], spec, {}, {}, read_pitch(above[0], spec), {}, {}, {}, {})
     folder = path if path.is_dir() else path.parent
     clip = path.name.removesuffix(".npz").removesuffix(".joints")
     rate = clip_frame_rate(read_frame_rates(folder), clip)

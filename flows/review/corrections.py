@@ -63,8 +63,8 @@ def _replay_corrections(
 
 def objections_of(run: Run) -> dict[str, str]:
     """Return why corrections in force do not apply to the results of a run, by their ids."""
-    found = lost_names(run)
     standing = read_journal(run.store, run.record.match_id).standing
+    found = {name: why for name, why in lost_names(run).items() if name in standing}
     said = {name: each.edit.model_dump(mode="json") for name, each in standing.items()}
     for unit, figures in run.record.figures.items():
         if unit not in run or not figures.get("corrections_refused"):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 from data_contracts.review import Edit, MergedTracks, NamedTrack, SplitTrack
@@ -24,7 +24,7 @@ from worldpose.review.identities import (
     replay_identities,
     stored_identities,
 )
-from worldpose.review.journal import Journal, read_journal
+from worldpose.review.journal import read_journal
 from worldpose.store.store import Run, Store
 
 
@@ -46,20 +46,22 @@ def identities_now(store: Store, match: Match, clip: str) -> IdentityReplay:
     stored = open_stored(store, store.run(match_id), name, "identities")
     moves = [edit for edit in said if isinstance(edit, TRACK_EDITS)]
     later = edits_since(moves, stored.edits, f"clip {clip}", match_id)
-    return _replay(stored, said, moves[: len(moves) - len(later)])
+    stated = _stated_names(store, match_id, clip)
+    return _replay(stored, said, moves[: len(moves) - len(later)], stated)
 
 
-def names_said(journal: Journal) -> str:
+def names_said(match: Match) -> str:
     """Return a text that changes with the names of people, and with no other correction."""
-    named = (name for name, each in journal.standing.items() if isinstance(each.edit, NamedTrack))
-    return " ".join(sorted(named))
+    standing = match.journal.standing.items()
+    named = (name for name, each in standing if isinstance(each.edit, NamedTrack))
+    return f"{' '.join(sorted(named))} {[each.people for each in match.folder.spec.clips]}"
 
 
 def names_of(run: Run, clip: str) -> dict[int, str]:
     """Return the newest names of a run's people by id.
 
-    A name belongs to no result: the journal's names are replayed over the tracks of the run, in
-    order with the merges and splits that these contain.
+    A name belongs to no result: over the names that match.yaml states now, the journal's are
+    replayed, in order with the merges and splits that the tracks of the run contain.
     """
     return _replay_names(run, clip)[1]
 
@@ -67,12 +69,14 @@ def names_of(run: Run, clip: str) -> dict[int, str]:
 def lost_names(run: Run) -> dict[str, str]:
     """Return why names fit no person of a run any more, by the ids of their corrections.
 
-    A name that a later correction gives again is not lost.
+    Names of match.yaml have clip and person for an id. A name that another person got is not lost.
     """
     lost: dict[str, str] = {}
     for unit, key in run.record.results.items():
         stage, _, clip = unit.partition("/")
-        if stage == "tracking" and run.store.has(run.record.match_id, stage, clip, key):
+        if stage in ("tracking", "broadcast_tracking") and run.store.has(
+            run.record.match_id, stage, clip, key
+        ):
             lost |= _replay_names(run, clip)[0]
     return lost
 
@@ -80,8 +84,13 @@ def lost_names(run: Run) -> dict[str, str]:
 def _replay_names(run: Run, clip: str) -> tuple[dict[str, str], dict[int, str]]:
     """Return lost names with the reasons, by correction, and all others by person."""
     match_id, unit = run.record.match_id, f"tracking/{clip}"
-    journal = read_journal(run.store, match_id)
-    if unit not in run or not any(
+    journal, stated = read_journal(run.store, match_id), _stated_names(run.store, match_id, clip)
+    if unit not in run:
+        plane = f"broadcast_tracking/{clip}"
+        ids = run[plane]["person"].values.tolist() if plane in run else [*stated]
+        names = {person: name for person, name in stated.items() if person in ids}
+        return _lost_stated(clip, stated, ids, names), names
+    if not stated and not any(
         isinstance(each.edit, NamedTrack) and each.edit.clip == clip
         for each in journal.standing.values()
     ):
@@ -99,26 +108,48 @@ def _replay_names(run: Run, clip: str) -> tuple[dict[str, str], dict[int, str]]:
     stored = open_stored(run.store, run.record, unit, "identities")
     moved = [edit for edit in said.values() if isinstance(edit, TRACK_EDITS)]
     edits = list(said.values())
-    replay = _replay(stored, edits, moved if stored.edits else [], with_joints=False)
-    names = replay.identities.names
+    taken = moved if stored.edits else []
+    replay = _replay(stored, edits, taken, stated, with_joints=False)
+    ids = replay.identities.person.tolist()
+    names = {person: name for person, name in replay.identities.names.items() if person in ids}
     lost = {
         name: f"{edit.name!r} names no person: {why}. Name the person again, or withdraw the name"
         for (name, edit), why in zip(said.items(), replay.objections, strict=True)
         if isinstance(edit, NamedTrack) and edit.name and why and edit.name not in names.values()
     }
-    return lost, names
+    return lost | _lost_stated(clip, stated, ids, names), names
+
+
+def _stated_names(store: Store, match_id: str, clip: str) -> dict[int, str]:
+    """Return the names of a clip's people in match.yaml, by person."""
+    registration = store.registration(match_id)
+    clips = () if registration is None else registration.spec.clips
+    return next((dict(each.people) for each in clips if each.id == clip), {})
+
+
+def _lost_stated(
+    clip: str, stated: Mapping[int, str], ids: Collection[int], names: Mapping[int, str]
+) -> dict[str, str]:
+    """Return why names of match.yaml fit no person, by clip and person."""
+    return {
+        f"{clip}/{person}": f"{name!r} in match.yaml names no person: clip {clip} has no person "
+        f"{person}. Correct the clip's `people`"
+        for person, name in stated.items()
+        if person not in ids and name not in names.values()
+    }
 
 
 def _replay(
     stored: StoredResult,
     said: Sequence[IdentityEdit],
     taken: Sequence[IdentityEdit],
+    stated: Mapping[int, str],
     *,
     with_joints: bool = True,
 ) -> IdentityReplay:
     """Replay corrections over a result that contains the merges and splits `taken` already.
 
-    The objections are in the order of `said`.
+    People have the names `stated` before. The objections are in the order of `said`.
     """
     merged, others = dict[int, IdentityEdit](), dict[int, IdentityEdit]()
     for number, edit in enumerate(said):
@@ -134,6 +165,7 @@ def _replay(
         elif edit not in taken:
             others[number] = edit
     tracks = stored_identities(stored.result, with_joints=with_joints)
+    tracks = replace(tracks, names=dict(stated))
     order = merged | others  # a person's own name counts more
     replay = replay_identities(tracks, order.values())
     found = dict(zip(order, replay.objections, strict=True))

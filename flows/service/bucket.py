@@ -10,6 +10,7 @@ import json
 import logging
 import shutil
 from collections import defaultdict
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -58,7 +59,9 @@ class BucketInbox:
         """
         fetched = []
         for name, objects in self._list_objects().items():
-            fingerprint = _fingerprint(objects)
+            fingerprint = _digest(
+                f"{it.path}\n{it.size} {it.modified.isoformat()}" for it in objects
+            )
             seen, since = self._since.get(name, ("", now))
             if seen != fingerprint:
                 since = now
@@ -125,16 +128,12 @@ class BucketInbox:
             draft.write_text(json.dumps(self._copied, indent=2) + "\n")
 
 
-def _fingerprint(objects: list[Entry]) -> str:
-    return _digest([f"{each.path}\n{each.size} {each.modified.isoformat()}" for each in objects])
-
-
 def _fingerprint_files(folder: Path) -> str:
     files = ((path, path.stat()) for path in folder.rglob("*") if path.is_file())
     return _digest(
-        [f"{it.relative_to(folder)}\n{about.st_size} {about.st_mtime_ns}" for it, about in files]
+        f"{it.relative_to(folder)}\n{about.st_size} {about.st_mtime_ns}" for it, about in files
     )
 
 
-def _digest(lines: list[str]) -> str:
+def _digest(lines: Iterable[str]) -> str:
     return hashlib.sha256("\n".join(sorted(lines)).encode()).hexdigest()

@@ -155,15 +155,11 @@ def _sums(file: Path) -> Iterator[tuple[str, str]]:
 def _entries(folder: Path, prefix: str, priority: Priority) -> Iterator[Entry]:
     for path in sorted(folder.iterdir()):
         if not path.name.startswith("."):
-            yield Entry(path, prefix + _shorten_name(path.name), priority)
+            yield Entry(path, prefix + ascii(path.name)[1:-1], priority)
 
 
 def _is_match(folder: Path) -> bool:
     return (folder / "match.yaml").is_file()
-
-
-def _shorten_name(name: str) -> str:
-    return ascii(name)[1:-1]
 
 
 def _require_plain(name: str) -> None:

@@ -62,7 +62,8 @@ class ProjectMetrics(Collector):
             matches = self._overview.look(LOOK_SECONDS)
             size = self._store_size()
         ended = [each for match in matches for each in match.poses]
-        last = sorted(matches, key=_ended_at)[-MOST_MATCHES:]
+        ended_at = {it.match_id: it.latest.finished_at.timestamp() for it in matches if it.latest}
+        last = sorted(matches, key=lambda it: ended_at.get(it.match_id, 0.0))[-MOST_MATCHES:]
         whole = [self._overview.read(each.match_id) for each in last if not each.is_unseen]
         states = Counter(match.state for match in matches)
         found = {(state,): states[state] for state in STATES}
@@ -136,10 +137,6 @@ def _gauge(name: str, about: str, labels: Sequence[str], values: Mapping[Any, fl
     for labelled, value in values.items():
         family.add_metric(labelled, value)
     return family
-
-
-def _ended_at(match: MatchSummary) -> float:
-    return 0.0 if match.latest is None else match.latest.finished_at.timestamp()
 
 
 def _unit_metrics(matches: list[MatchSummary], whole: list[MatchSummary]) -> Iterator[Metric]:

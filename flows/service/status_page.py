@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 from urllib.parse import quote
 
 from fastapi import APIRouter
@@ -79,13 +79,9 @@ def routes(context: PageContext) -> APIRouter:
         rest = BackgroundTask(overview.look, REST_SECONDS) if is_late(found) else None
         return HTMLResponse(text, background=rest)
 
-    @router.get("/status/page.css")
-    def style() -> Response:
-        return FileResponse(FILES / "page.css")
-
-    @router.get("/status/page.js")
-    def script() -> Response:
-        return FileResponse(FILES / "page.js")
+    @router.get("/status/page.{kind}")
+    def file(kind: Literal["css", "js"]) -> Response:
+        return FileResponse(FILES / f"page.{kind}")
 
     return router
 

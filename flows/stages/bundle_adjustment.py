@@ -40,6 +40,7 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
     """Return the clips, the clock, the camera order, and the pitch that clicked points refer to."""
     spec = match.folder.spec
     return {
+        **tracking.clock_sources(match),
         "cameras": [camera.id for camera in spec.static_cameras],
         "seen": {clip.id: list(detection.seen_by_cameras(match, clip.id)) for clip in spec.clips},
         "clips": {clip.id: [clip.first_frame, clip.frame_count] for clip in spec.clips},

@@ -62,22 +62,25 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
 
 
 def clip_sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """Return the clip's frames, the clock, the cameras in order, and their detections.
-
-    `clocks` has the offset and the rate of each camera, unless all show whole match frames.
-    """
+    """Return the clip's frames, the clock, the cameras in order, and their detections."""
     spec = match.folder.spec
     clip = spec.clip(unit)
-    clocks = [unit_frames(spec, camera.id) for camera in spec.static_cameras]
-    is_whole = all(isinstance(each.offset, int) and each.rate == 1.0 for each in clocks)
     return {
-        **({} if is_whole else {"clocks": [each.clock for each in clocks]}),
+        **clock_sources(match),
         "cameras": [camera.id for camera in spec.static_cameras],
         "seen": list(detection.seen_by_cameras(match, unit)),
         "first_frame": clip.first_frame,
         "frame_count": clip.frame_count,
         "fps": spec.fps,
     }
+
+
+def clock_sources(match: Match) -> dict[str, JsonValue]:
+    """Return offset and rate of each static camera; none if all show whole match frames."""
+    spec = match.folder.spec
+    clocks = [unit_frames(spec, camera.id) for camera in spec.static_cameras]
+    is_whole = all(isinstance(each.offset, int) and each.rate == 1.0 for each in clocks)
+    return {} if is_whole else {"clocks": [each.clock for each in clocks]}
 
 
 STAGE = Stage(

@@ -26,7 +26,7 @@ from flows.run_record import latest_run
 from flows.stage import Match
 from flows.web.app_context import PageContext
 from flows.web.browser_words import describe_error
-from flows.web.images import encode_image
+from flows.web.images import encode_image, file_mark
 from worldpose.errors import InputError, WorldposeError
 from worldpose.ingest.footage import read_still, unit_frames
 from worldpose.pitch.template import PitchTemplate
@@ -75,7 +75,7 @@ class Pictures:
     """Cache of the images decoded last, on which users click."""
 
     def __init__(self) -> None:
-        self._decoded: OrderedDict[tuple[str, str, int | None], NDArray[np.uint8]] = OrderedDict()
+        self._decoded: OrderedDict[tuple[object, ...], NDArray[np.uint8]] = OrderedDict()
         self._lock = Lock()
 
     def png(self, match: Match, owner: str, frame: int | None) -> bytes:
@@ -95,10 +95,14 @@ class Pictures:
         Raises:
             HTTPException: 404, there is none.
         """
-        name = (match.match_id, owner, frame)
+        stills, videos = match.folder.stills, match.folder.videos
+        file = (stills if frame is None and owner in stills else videos).get(owner)
+        if file is None:
+            raise HTTPException(404, "there is no picture")
+        name = (match.match_id, owner, frame, file_mark(file))
         with self._lock:
             if name not in self._decoded:
-                self._decoded[name] = _read(match, owner, frame)
+                self._decoded[name] = _read(match, owner, frame, file)
             self._decoded.move_to_end(name)
             while len(self._decoded) > CACHED_IMAGES:
                 self._decoded.popitem(last=False)
@@ -246,18 +250,14 @@ def warm_up(context: PageContext) -> None:
     gc.freeze()  # collecting long journals as garbage would delay requests
 
 
-def _read(match: Match, owner: str, frame: int | None) -> NDArray[np.uint8]:
-    folder = match.folder
-    still = folder.stills.get(owner)
-    if frame is None and still is not None:
-        camera = folder.spec.camera(owner)
-        return read_still(still, (camera.width, camera.height))
-    if owner not in folder.videos:
-        raise HTTPException(404, "there is no picture")
-    with open_video(folder.videos[owner]) as video:
+def _read(match: Match, owner: str, frame: int | None, file: Path) -> NDArray[np.uint8]:
+    spec = match.folder.spec
+    if file == match.folder.stills.get(owner):
+        camera = spec.camera(owner)
+        return read_still(file, (camera.width, camera.height))
+    with open_video(file) as video:
         number = 0
         if frame is not None:
-            spec = folder.spec
             fps = spec.fps * unit_frames(spec, owner).rate
             number = int(video.index.shown(np.array([frame]), fps, owner)[0])
         if not 0 <= number < len(video):

@@ -16,6 +16,7 @@ from pydantic import Field, JsonValue
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec, Side
 from data_contracts.records import CONTRACT_VERSION, Count, Name, Record
+from flows.layers import known_pitch
 from flows.web.browser_words import in_browser
 from worldpose.errors import InputError
 from worldpose.formats.annotations.marked_images import read_marked_images
@@ -34,6 +35,7 @@ from worldpose.ingest.footage import read_still, require_footage
 from worldpose.ingest.importing import describe_left_out, describe_people, import_lenses
 from worldpose.ingest.match_folder import MatchFolder, image_sizes, read_spec
 from worldpose.ingest.validation import list_problems
+from worldpose.store.store import Store
 from worldpose.video.folder import SUFFIXES as IMAGE_SUFFIXES
 from worldpose.video.folder import declared_size
 from worldpose.video.names import is_video
@@ -193,7 +195,9 @@ def footage_problems(
             yield {**describe(error, match.folder), "place": place}
 
 
-def take_given(given: Path, folder: Path, indexes: Mapping[str, Index | None]) -> list[str]:
+def take_given(
+    store: Store, given: Path, folder: Path, indexes: Mapping[str, Index | None]
+) -> list[str]:
     """Write what other tools' files say into a match folder; return sentences about it.
 
     A calibration is told by its form. Any other file has 2D poses, clicks or a lens of the camera
@@ -201,6 +205,7 @@ def take_given(given: Path, folder: Path, indexes: Mapping[str, Index | None]) -
     no other camera. Clicks may also be in images that are named after cameras.
 
     Args:
+        store: its settings can state the pitch.
         given: folder of the files.
         folder: the match folder, with match.yaml and the videos.
         indexes: frames of the videos, by path in the match folder.
@@ -220,7 +225,7 @@ def take_given(given: Path, folder: Path, indexes: Mapping[str, Index | None]) -
             posed.add(file)
         elif kind == "clicks":
             try:
-                found = import_clicks(file, folder, owner)
+                found = import_clicks(file, folder, owner, known_pitch(store, folder, spec))
             except InputError as error:
                 if "--camera" not in error.todo:  # the images are named after no cameras
                     raise

@@ -243,18 +243,24 @@ class Drafts:
             self._write_piece(draft_id, file, chunk)
             return True, received + len(chunk)
 
-    def frame(self, draft_id: str, file_id: str, number: int, width: int) -> NDArray[np.uint8]:
-        """Return a frame of a video (height, width, 3) RGB, scaled to a width [px].
+    def frame(
+        self, draft_id: str, file_id: str, number: int, fps: float, width: int
+    ) -> NDArray[np.uint8]:
+        """Return the image (height, width, 3) RGB at a frame of a camera's clock, `fps` a second.
+
+        It is that of `FrameIndex.on_clock`, or the nearest one where the video has none, scaled to
+        a width [px].
 
         Raises:
-            InputError: there is no such video or frame, or the frame is damaged.
+            InputError: there is no such video or frame, or the image is damaged.
         """
         _, file = self._find(draft_id, file_id)
         index = self._index(draft_id, file) if self._whole(draft_id, file).exists() else None
-        if not isinstance(index, FrameIndex) or not 0 <= number < len(index):
+        if not isinstance(index, FrameIndex) or not 0 <= number <= np.rint(index.times[-1] * fps):
             raise InputError(file.title, f"a video with frame {number}", "none", "Choose another.")
+        picture = int(np.abs(index.times - number / fps).argmin())
         with VideoReader(self._whole(draft_id, file), index) as video:
-            for _, image in video.readable(number, number + 1, width=min(width, index.size[0])):
+            for _, image in video.readable(picture, picture + 1, width=min(width, index.size[0])):
                 if image is not None:
                     return image
         raise InputError(file.title, f"frame {number}", "a damaged one", "Choose another frame.")
@@ -277,14 +283,18 @@ class Drafts:
             "is_ready": not problems,
         }
 
-    def finish(self, draft_id: str, priority: Priority) -> str:
+    def finish(self, draft_id: str, priority: Priority, revision: int | None = None) -> str | None:
         """Move a draft's match folder into the inbox in one step; return its path there.
+
+        Nothing is moved, and None returned, if another form was saved since `revision`.
 
         Raises:
             InputError: something is wrong or missing.
         """
         with self._hold(draft_id):
             draft = self.read(draft_id)
+            if revision not in (None, draft.revision):
+                return None
             if problems := self._view(draft)["problems"]:
                 raise InputError(
                     "match", "nothing missing", problems[0]["message"], "Complete it, then finish."
@@ -393,7 +403,7 @@ class Drafts:
         size = index.size if isinstance(index, FrameIndex) else index
         shape: dict[str, Any] = dict(zip(("width", "height"), size, strict=True))
         if isinstance(index, FrameIndex):
-            shape |= {"fps": index.fps, "frames": len(index)}
+            shape |= {"fps": index.fps, "frames": len(index), "seconds": float(index.times[-1])}
         return {**content, "state": "ready", **shape}
 
     def _work(

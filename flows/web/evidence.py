@@ -29,7 +29,7 @@ from flows.stage import Match
 from flows.stages.detection import seen_by
 from flows.web.app_context import PageContext
 from flows.web.images import encode_image
-from flows.web.results import DrawnFiles
+from flows.web.results import DrawnFiles, footage_mark
 from worldpose.errors import InputError
 from worldpose.formats.joints_file import JointTracks
 from worldpose.reports.clips import plot_paths
@@ -68,12 +68,12 @@ def routes(context: PageContext) -> APIRouter:
     lock, videos = Lock(), DrawnFiles()
 
     @lru_cache(CACHED_REVIEWS)
-    def draw(match_id: str, request: str) -> Evidence:
+    def draw(match_id: str, request: str, shows: str) -> Evidence:
         return draw_evidence(context.store, *context.review(match_id, request))
 
     def evidence_of(match_id: str, request: str) -> Evidence:
         with lock:  # one at a time: drawing needs memory for all images
-            return draw(match_id, request)
+            return draw(match_id, request, footage_mark(context.match(match_id)))
 
     @router.get("/evidence")
     def evidence(match_id: str, request: str) -> dict[str, Any]:
@@ -133,13 +133,19 @@ def thin_curve(values: NDArray[np.float64], every: int) -> NDArray[np.float64]:
 
 
 def draw_evidence(store: Store, match: Match, request: ReviewRequest) -> Evidence:
-    """Draw the evidence for a review request, from the newest run with the results under review."""
+    """Draw the evidence for a review request, from the newest run with the results under review.
+
+    A table says which videos are not at hand: their images are not among it.
+    """
     draw = _DRAWN.get(request.gate)
     if draw is None:
         return Evidence()
-    run = asked_run(store, request)
+    run, there = asked_run(store, request), match.at_hand()
     (unit,) = request.keys
-    return draw(store, run, match, unit.partition("/")[2])
+    found = draw(store, run, there, unit.partition("/")[2])
+    gone = [(name,) for name in match.folder.videos if name not in there.folder.videos]
+    said = (Table("Videos that are not at hand: their images are not shown", ("",), tuple(gone)),)
+    return replace(found, tables=(*found.tables, *(said if gone else ())))
 
 
 def asked_run(store: Store, request: ReviewRequest) -> Run:

@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from fastapi.responses import Response
 
 from data_contracts.arrays import Image
+
+
+def file_mark(file: Path) -> tuple[str, int, int]:
+    """Return a file's path, size [byte] and time of its last change [ns]; of another, others."""
+    status = file.stat()
+    return str(file), status.st_size, status.st_mtime_ns
 
 
 def encode_image(image: Image, kind: str) -> bytes:

@@ -39,6 +39,7 @@ CHUNK_SUFFIX: Final = "/bytes"
 """Suffix of the paths that take chunks; all others take JSON."""
 FRAME_PX: Final = 960
 """Maximum width of the frames that a page compares, unless it looks at one close up [px]."""
+OVERTAKEN: Final = "another page saved this form meanwhile: look at it as it is now"
 
 
 @dataclass(frozen=True)
@@ -99,6 +100,8 @@ class Finish(Record):
     """The request to put a match into the inbox."""
 
     priority: Priority = "normal"
+    revision: Count | None = None
+    """Revision of the form that the person saw; None = any."""
 
 
 def routes(context: PageContext, intake: Intake | None) -> APIRouter:
@@ -194,7 +197,7 @@ def _draft_routes(drafts: Drafts, intake: Intake, context: PageContext) -> APIRo
     @router.post("/{draft}/form")
     def save(draft: str, given: SavedForm) -> dict[str, Any]:
         if not drafts.save(draft, given.content, given.revision):
-            raise HTTPException(409, "another page saved this form first: load it again")
+            raise HTTPException(409, OVERTAKEN)
         return drafts.view(draft)
 
     @router.post("/{draft}/removal")
@@ -204,7 +207,10 @@ def _draft_routes(drafts: Drafts, intake: Intake, context: PageContext) -> APIRo
 
     @router.post("/{draft}/finish")
     def finish(draft: str, given: Finish) -> dict[str, Any]:
-        return {"arrived": drafts.finish(draft, given.priority)}
+        arrived = drafts.finish(draft, given.priority, given.revision)
+        if arrived is None:
+            raise HTTPException(409, OVERTAKEN)
+        return {"arrived": arrived}
 
     _add_files(router, drafts, intake)
     return router
@@ -247,9 +253,13 @@ def _add_files(router: APIRouter, drafts: Drafts, intake: Intake) -> None:
 
     @router.get("/{draft}/files/{file}/frames/{number}")
     def frame(
-        draft: str, file: str, number: int, width: Annotated[int, Query(ge=1, le=8192)] = FRAME_PX
+        draft: str,
+        file: str,
+        number: int,
+        fps: Annotated[float, Query(gt=0.0, allow_inf_nan=False)],
+        width: Annotated[int, Query(ge=1, le=8192)] = FRAME_PX,
     ) -> Response:
-        return image_response(drafts.frame(draft, file, number, width), "jpeg")
+        return image_response(drafts.frame(draft, file, number, fps, width), "jpeg")
 
     @router.post("/{draft}/files/{file}/removal")
     def remove(draft: str, file: str) -> dict[str, Any]:

@@ -38,6 +38,7 @@ from flows.review.identities import names_said
 from flows.stage import Match
 from flows.web.app_context import PageContext
 from flows.web.browser_words import describe_error, in_browser
+from flows.web.images import file_mark
 from worldpose.errors import WorldposeError
 from worldpose.formats.viewer_file import ViewerClip, encode_frames, encode_scene
 from worldpose.store.runs import LATEST
@@ -84,12 +85,18 @@ class DrawnFiles:
         return file
 
     def clip_video(self, store: Store, run: Run, match: Match, clip: str) -> FileResponse:
-        """Return the response with the overlay video of a clip."""
+        """Return the response with the overlay video of a clip.
+
+        Raises:
+            HTTPException: 404, no video of the clip is at hand.
+        """
+        if clip_view(run, match, clip) is None:
+            raise HTTPException(404, "no video of this clip is at hand")
         file = self.get(
             run,
             f"{clip}.mp4",
             lambda file: write_clip_video(store, run, match, clip, file),
-            names_said(match.journal),
+            f"{names_said(match)} {footage_mark(match)}",
         )
         return FileResponse(file, media_type="video/mp4")
 
@@ -103,7 +110,8 @@ class _Clips:
         self._clip: ViewerClip | None = None
 
     def get(self, run: Run, match: Match, clip: str) -> ViewerClip:
-        key = (run.record.run_id, clip, _people_said(match))
+        there = [*match.at_hand().folder.videos]
+        key = (run.record.run_id, clip, f"{_people_said(match)} {there}")
         with self._lock:
             if self._clip is None or self._key != key:
                 origin = Origin(run, match.registration)
@@ -115,7 +123,14 @@ class _Clips:
 
 def _people_said(match: Match) -> str:
     """Return a text that changes with a match's id, roster and names of people."""
-    return f"{match.registration.model_dump_json()} {names_said(match.journal)}"
+    return f"{match.registration.model_dump_json()} {names_said(match)}"
+
+
+def footage_mark(match: Match) -> str:
+    """Return a text that changes with the videos and stills of a match that are at hand."""
+    folder = match.at_hand().folder  # nothing while the folder is away
+    files = (*folder.videos.values(), *folder.stills.values())
+    return str([file_mark(file) for file in files if file.exists()])
 
 
 def _player_names(match: Match, run: Run) -> dict[str, str]:
@@ -187,9 +202,8 @@ def routes(context: PageContext) -> APIRouter:
             run_id = run.record.run_id
             write_report(context.store, match, file, run_id=run_id, videos=False)
 
-        there = match.at_hand().folder  # nothing while the folder is away
-        seen = [*there.videos, *there.stills, *there.clicked, *there.calibrations]
-        shows = f"{_people_said(match)} {match.journal.tip} {seen}"
+        given = [*match.folder.clicked, *match.folder.calibrations]
+        shows = f"{_people_said(match)} {match.journal.tip} {given} {footage_mark(match)}"
         return FileResponse(
             files.get(run, "report.html", draw, shows),
             media_type="text/html; charset=utf-8",
@@ -199,8 +213,8 @@ def routes(context: PageContext) -> APIRouter:
     @router.get("/videos/{clip}")
     def video(match_id: str, clip: str, run_id: Name = LATEST) -> FileResponse:
         match, run = open_asked(match_id, run_id)
-        if clip not in clips_of(run.record) or clip_view(run, match, clip) is None:
-            raise HTTPException(404, "no camera of such a clip has a video")
+        if clip not in clips_of(run.record):
+            raise HTTPException(404, "the run has no such clip")
         return files.clip_video(context.store, run, match, clip)
 
     @router.get("/health/{clip}")

@@ -116,23 +116,16 @@ def test_the_library_imports_without_orchestrators(package):
     subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT)
 
 
-def test_deciding_what_to_run_imports_neither_prefect_nor_dask():
-    script = (
-        "import sys\n"
-        "import flows.running, flows.run_plan, flows.cli.app\n"
-        "loaded = {'prefect', 'dask', 'distributed'} & set(sys.modules)\n"
-        "assert not loaded, loaded\n"
-    )
-    subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT)
-
-
-def test_processes_that_a_run_starts_import_no_command():
-    script = (
-        "import sys\n"
-        "import flows.cli\n"  # as each of them does, for the module of `main`
-        "loaded = {'typer', 'numpy', 'flows.cli.app'} & set(sys.modules)\n"
-        "assert not loaded, loaded\n"
-    )
+@pytest.mark.parametrize(
+    ("modules", "unwanted"),
+    [
+        ("flows.running, flows.run_plan, flows.cli.app", "prefect dask distributed"),
+        # As each process that a run starts imports it, for the module of `main`.
+        ("flows.cli", "typer numpy flows.cli.app"),
+    ],
+)
+def test_deciding_what_to_run_and_starting_processes_import_little(modules, unwanted):
+    script = f"import sys, {modules}\nassert not set({unwanted.split()}) & set(sys.modules)\n"
     subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT)
 
 

@@ -11,11 +11,12 @@ import jsonschema
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from run_records import match_spec
 
 import data_contracts
 import worldpose
 from data_contracts.arrays import CHUNK_BYTES, array_layout
-from data_contracts.match import CameraSpec, ClipSpec, MatchSpec, PlayerSpec
+from data_contracts.match import MatchSpec, PlayerSpec
 from data_contracts.records import Record
 from data_contracts.schemas import LAYOUTS, documents
 
@@ -78,14 +79,7 @@ def roster(red, blue, officials):
     [((11, 11, 3), 25), ((16, 18, 1), 23), ((11, 11, 0), None), ((11, 5, 3), None)],
 )
 def test_eleven_of_each_team_and_the_officials_are_allowed_if_all_are_named(people, limit):
-    spec = MatchSpec(
-        match_id="final",
-        fps=25.0,
-        cameras=(CameraSpec(id="left", width=1920, height=1080),),
-        clips=(ClipSpec(id="clip", first_frame=0, frame_count=1),),
-        roster=roster(*people),
-    )
-    assert spec.max_people == limit
+    assert match_spec(["left"], roster=roster(*people)).max_people == limit
 
 
 MEASURED = {"figures"}

@@ -70,7 +70,7 @@ await page.fill('[data-field="match_id"]', "cup final");
 seen.name = await page.inputValue('[data-field="match_id"]');
 await page.waitForSelector('[data-saving="saved"]');
 await page.unroute("**/form");
-seen.refused = await page.locator("text=saved this form first").count();
+seen.refused = await page.locator("[data-again]").count();
 await page.waitForSelector("text=Nothing is missing");
 await page.locator("select[data-side]").first().selectOption("far");
 await page.waitForSelector("text=Nothing is missing");
@@ -82,7 +82,7 @@ await frames.nth(0).fill("5");
 await frames.nth(1).fill("8");
 await page.waitForFunction(() => {
   const [one, other] = [...document.querySelectorAll("dialog img")];
-  return one.src.endsWith("/5") && other.src.endsWith("/8") && one.naturalWidth && other.naturalWidth;
+  return one.src.endsWith("/5?fps=25") && other.src.endsWith("/8?fps=25") && one.naturalWidth && other.naturalWidth;
 });
 for (const [width, height] of [[1440, 900], [390, 844]]) {
   await page.setViewportSize({ width, height });
@@ -103,9 +103,15 @@ await page.locator("select[data-still]").first().selectOption("stills/first.png"
 await page.setInputFiles("[data-upload]", task.clicks);
 await page.waitForSelector('[data-notes] >> text="second_keypoints.xml: 1 clicks in second"');
 await page.click("text=Paste a list");
-await page.fill("[data-paste]", "kane; Harry Kane; England\npickford\tJordan Pickford\tEngland\tgoalkeeper");
+await page.fill("[data-paste]", "ID;Name;Team;Role\nkane; Harry Kane; England\npickford\tPickford, Jordan\tEngland\tGK");
 await page.click("text=Add these people");
 await page.waitForSelector("[data-person='1']");
+await page.waitForSelector("label.wrong .said >> text=goalkeeper"); // a role that is none is named, not dropped
+seen.pasted = [await page.locator("[data-pasted]").innerText()];
+await page.click("text=Paste a list");
+await page.fill("[data-paste]", "pickford, Jordan Pickford, , goalkeeper");
+await page.click("text=Add these people");
+seen.pasted.push(await page.locator("[data-pasted]").innerText());
 await page.waitForSelector('[data-saving="saved"]');
 await page.waitForSelector("text=Nothing is missing");
 for (const [width, height] of [[1440, 900], [1280, 720], [390, 844]]) {
@@ -113,9 +119,39 @@ for (const [width, height] of [[1440, 900], [1280, 720], [390, 844]]) {
   seen[`overflow_${width}`] = await page.evaluate(() => document.documentElement.scrollWidth - innerWidth);
   await shoot(page, `ready_${width}`);
 }
+// Another page saves the form: this one says so, and shows that form.
+async function takeOther(fps) {
+  await page.evaluate(async ([path, fps]) => {
+    const [{ form_secret }, { revision, content }] = await Promise.all(["/api/session", path].map(async (each) => (await fetch(each)).json()));
+    [content.match_id, content.cameras[1].fps] = ["cup_other", fps];
+    const headers = { "content-type": "application/json", "x-form-secret": form_secret };
+    await fetch(`${path}/form`, { method: "POST", headers, body: JSON.stringify({ revision, content }) });
+  }, [`/api/drafts/${seen.link.split("/").at(-1)}`, fps]);
+  await page.fill('[data-field="fps"]', "26");
+  await page.click("[data-again]");
+}
+await takeOther(50);
+seen.again = [await page.inputValue('[data-field="match_id"]'), await page.inputValue('[data-field="fps"]')];
+// On a clock of twice the rate, the moment of frame 5 is frame 10, and 6 later with an offset of 6.
+await page.click("[data-offsets]");
+await frames.nth(0).fill("5");
+await frames.nth(1).fill("16");
+seen.offset = await page.locator("dialog figcaption").nth(1).innerText();
+await page.click("dialog >> text=Cancel");
+await takeOther();
+// The form is left while the server is away: it is saved when the server is back.
+await page.route("**/api/drafts/**", (route) => route.abort());
+await page.fill('[data-field="match_id"]', "cup_final");
+await page.waitForSelector('[data-saving="not saved"]');
+await page.click("a.home");
+const saved = page.waitForResponse((answer) => answer.url().endsWith("/form") && answer.ok());
+await page.unroute("**/api/drafts/**");
+await saved;
+await page.goto(seen.link);
+await page.waitForSelector("text=Nothing is missing");
 await page.click("[data-finish]");
 await page.waitForSelector("text=cup_final");
 await shoot(page, "arrived");
 // The restart was meant: while the server was away, the browser said so in its console.
-seen.errors = seen.errors.filter((text) => !/ERR_CONNECTION|ERR_EMPTY|409|Failed to fetch/.test(text));
+seen.errors = seen.errors.filter((text) => !/ERR_CONNECTION|ERR_EMPTY|ERR_FAILED|409|Failed to fetch/.test(text));
 await tell(seen);

@@ -34,6 +34,10 @@ def test_a_broadcast_clip_is_calibrated_scored_and_shown(server, tmp_path):
     with VideoReader(tmp_path / "page-clip.mp4") as video:
         assert (len(video), video.frame(0).shape) == (30, (540, 960, 3))
     assert told["videos"] == [str(tmp_path / "page-clip.mp4")]
+    (match / "broadcast" / "clip.mp4").unlink()  # results outlive their videos
+    told = succeed("report", match, "--project", project, "--out", page, "--json").json
+    assert told["videos"] == []
+    assert "known least" in page.read_text() and "Mean joint error" in page.read_text()
 
 
 def test_a_broadcast_camera_alone_gives_places_and_with_estimates_bodies(server, tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from typer.testing import CliRunner
 from data_contracts.cameras import LensCalibration
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from flows.cli.app import app
+from flows.cli.locate import _lens
 from flows.results.clock_offsets import propose
 from flows.run_record import latest_run
 from flows.service.inbox import run_key, take_in, watch_once
@@ -292,6 +294,23 @@ def test_cameras_are_found_and_written_in_place_of_lenses(server, lab, tmp_path)
     )
     assert isinstance(refused.exception, InputError)
     assert "calibration.toml: expected no calibration there yet" in str(refused.exception)
+
+
+def test_unequal_focal_lengths_widen_the_lens_or_are_refused(tmp_path):
+    def lens(fx, fy):
+        given = SimpleNamespace(
+            image_size=(1440, 1080),
+            focal_px=(fx, fy),
+            principal_point_px=(719.5, 539.5),
+            distortion=(0.0,) * 5,
+            lens_model="brown",
+        )
+        folder = SimpleNamespace(folder=tmp_path, lenses={}, calibrations={"a": given})
+        return _lens(SimpleNamespace(folder=folder), "a")
+
+    assert lens(1000.0, 1010.0).focal_std_px == 5.0
+    with pytest.raises(InputError, match=r"calibration.toml: a.matrix: .*1050 and 1400"):
+        lens(1050.0, 1400.0)
 
 
 @pytest.mark.parametrize(

@@ -8,11 +8,9 @@ import sys
 import pytest
 import typer
 import yaml
-from run_records import run_record
+from run_records import calibration, match_spec, run_record
 from typer.testing import CliRunner
 
-from data_contracts.cameras import CameraCalibration
-from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.run import UnitFailure, WaitingUnit
 from flows.cli import run as run_command
 from flows.cli.app import COMMANDS, app, summary
@@ -34,18 +32,16 @@ def test_every_command_loads_and_is_listed_with_its_help(name):
     assert f"\n  {name} " in listed
 
 
-def test_a_run_imports_nothing_that_only_draws():
-    script = (
-        "import sys\n"
-        "import flows.cli.run, flows.match, tasks.preload\n"
-        "assert 'matplotlib' not in sys.modules\n"
-    )
-    subprocess.run([sys.executable, "-c", script], check=True)
-
-
-def test_pages_import_what_opens_results_when_somebody_looks_at_one():
-    # xarray and pandas take 90 MB, of the 500 that a process of a service may have.
-    script = "import sys, flows.web.app\nassert not {'xarray', 'pandas'} & set(sys.modules)\n"
+@pytest.mark.parametrize(
+    ("modules", "unwanted"),
+    [
+        ("flows.cli.run, flows.match, tasks.preload", "matplotlib"),
+        # 90 MB, of the 500 that a process of a service may have.
+        ("flows.web.app", "xarray pandas"),
+    ],
+)
+def test_runs_and_pages_import_nothing_that_only_draws_or_opens_results(modules, unwanted):
+    script = f"import sys, {modules}\nassert not set({unwanted.split()}) & set(sys.modules)\n"
     subprocess.run([sys.executable, "-c", script], check=True)
 
 
@@ -90,13 +86,8 @@ def test_a_misspelt_command_names_the_one_that_may_be_meant():
 
 def made(folder, match_id, pitch=None):
     """A match with two cameras, one of them calibrated, that saw people in frames 0 to 9."""
-    spec = MatchSpec(
-        match_id=match_id,
-        fps=25.0,
-        cameras=tuple(CameraSpec(id=f"cam{c}", width=640, height=480) for c in range(2)),
-        clips=(ClipSpec(id="clip", frame_count=10),),
-        pitch=pitch,
-    )
+    clips = {"clip": {"frame_count": 10}}
+    spec = match_spec(["cam0", "cam1"], clips, (640, 480), match_id=match_id, pitch=pitch)
     (folder / "detections").mkdir(parents=True)
     (folder / "match.yaml").write_text(yaml.safe_dump(spec.model_dump(mode="json")))
     for place, camera in enumerate(spec.cameras):
@@ -111,20 +102,8 @@ def made(folder, match_id, pitch=None):
             for frame in range(10)
         ]
         (folder / "detections" / f"{camera.id}.json").write_text(json.dumps(people))
-    write_calibration_toml(
-        folder / "calibration.toml",
-        {
-            "cam0": CameraCalibration(
-                id="cam0",
-                image_size=(640, 480),
-                focal_px=(600.0, 600.0),
-                principal_point_px=(320.0, 240.0),
-                distortion=(0.0,) * 5,
-                rotation=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-                translation=(0.0, 0.0, 30.0),
-            )
-        },
-    )
+    small = calibration("cam0", image_size=(640, 480), principal_point_px=(320.0, 240.0))
+    write_calibration_toml(folder / "calibration.toml", {"cam0": small})
     return folder
 
 

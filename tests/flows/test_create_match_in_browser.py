@@ -96,7 +96,9 @@ def test_a_match_is_created_through_a_restart_and_a_reload(tmp_path):
     assert "letters, digits" in seen["message"]
     assert seen["refused"] == 0
     assert seen["name"] == "cup_final"  # a blank of a name is written as ids have it
-    assert seen["close"].endswith("/8?width=4096")
+    assert seen["close"].endswith("/8?fps=25&width=4096")
+    assert seen["pasted"] == ["2 added, 0 changed", "0 added, 1 changed"]
+    assert (seen["again"], seen["offset"]) == (["cup_other", "25"], "second offset 6 frames")
     assert [seen[f"overflow_{width}"] for width in (1440, 1280, 390)] == [0, 0, 0]
     assert [seen[f"overflow_dialog_{width}"] for width in (1440, 390)] == [0, 0]
     match = read_match(tmp_path / "inbox" / "cup_final")

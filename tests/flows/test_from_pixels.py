@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from command_line import succeed
+from page_client import log_in, served
 
 from flows.registering import open_match
 from flows.reports.match_pictures import background_image
@@ -16,6 +17,7 @@ from flows.results.best_results import Origin
 from flows.results.tool_exports import describe_clip
 from worldpose import open_run
 from worldpose.store.store import Store
+from worldpose.video.files import VideoReader
 
 
 def green_share(image):
@@ -50,6 +52,25 @@ def test_a_match_of_videos_alone_is_reported_over_images_of_its_videos(server, t
     origin = Origin(open_run(project, match_id), open_match(store, match_id).registration)
     keypoints = describe_clip(origin, "clip")["keypoints"]
     assert keypoints == "the embedded pose net of this version"
+    check_without_videos(match, project, page, f"/api/matches/{match_id}/results/videos/clip")
+
+
+def check_without_videos(match, project, page, film):
+    """Neither a black film nor a refused report: results outlive their videos."""
+    ada, videos = log_in(served(project), "Ada"), match / "videos"
+    (videos / "cam02.mp4").unlink()
+    told = succeed("report", match, "--project", project, "--out", page, "--json")
+    assert len(told.json["videos"]) == 1 and "Mean joint error" in page.read_text()
+    videos.rename(match / "away")
+    answer = ada.get(film)
+    assert (answer.status_code, answer.json()["detail"]) == (
+        404,
+        "no video of this clip is at hand",
+    )
+    (match / "away").rename(videos)
+    page.with_suffix(".mp4").write_bytes(ada.get(film).content)
+    with VideoReader(page.with_suffix(".mp4")) as video:
+        assert green_share(video.frame(0)[..., ::-1]) > 0.15
 
 
 @pytest.mark.slow

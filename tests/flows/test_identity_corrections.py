@@ -8,6 +8,7 @@ import pytest
 from command_line import TINY, succeed
 from page_client import MATCH
 
+from data_contracts.match import PlayerSpec
 from data_contracts.review import (
     Correction,
     DeletedDetection,
@@ -157,6 +158,26 @@ def test_a_name_whose_detection_is_gone_is_reported_until_it_is_given_again(stor
     assert (listed["id"], listed["reason"]) == ("c", said)
     say(store, d=NamedTrack(clip="clip", person=other, seen=wrong, name="Bea"))
     assert lost_names(run) == {}
+
+
+def test_names_of_the_match_folder_are_those_of_people_until_a_page_gives_others(store):
+    found = identities_now(store, open_match(store, TINY), "clip").identities
+    one, other = found.person.tolist()[:2]
+    registration = store.registration(TINY)
+    (clip,) = registration.spec.clips
+    named = clip.model_copy(update={"people": {one: "ann", other: "bea", 99: "cleo"}})
+    roster = tuple(PlayerSpec(id=name) for name in named.people.values())
+    spec = registration.spec.model_copy(update={"clips": (named,), "roster": roster})
+    store.register(registration.model_copy(update={"spec": spec}))
+    run = Run(store, store.run(TINY))
+    assert clip_positions(run, "clip").names[:2] == ["ann", "bea"]
+    (said,) = lost_names(run).values()
+    assert "'cleo' in match.yaml names no person: clip clip has no person 99" in said
+    assert objections_of(run) == {}  # of corrections alone
+    say(store, a=NamedTrack(clip="clip", person=one, name="Ann"))
+    say(store, b=NamedTrack(clip="clip", person=other, name=None))
+    assert names_of(run, "clip") == {one: "Ann"}
+    assert identities_now(store, open_match(store, TINY), "clip").identities.names[one] == "Ann"
 
 
 def test_every_door_refuses_what_does_not_fit_the_results(store):

@@ -5,13 +5,15 @@ import os
 import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
+from fractions import Fraction
 
+import av
 import cv2
 import numpy as np
 import page_client
 import pytest
+from run_records import calibration
 
-from data_contracts.cameras import CameraCalibration
 from flows.registering import register
 from flows.service.inbox import entries, fingerprint_of, missing_of, watch_once
 from flows.service.layout import served_state
@@ -337,7 +339,7 @@ def test_frames_of_an_uploaded_video_are_shown(place, footage):
     path = f"{DRAFTS}/{draft}/files/{view['files'][0]['id']}/frames"
     shown = {}
     for number in (0, FRAMES - 1):
-        answer = ada.get(f"{path}/{number}")
+        answer = ada.get(f"{path}/{number}?fps={FPS}")
         assert answer.headers["content-type"] == "image/jpeg"
         shown[number] = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR)
         assert shown[number].shape == (SIZE[1], SIZE[0], 3)
@@ -345,8 +347,42 @@ def test_frames_of_an_uploaded_video_are_shown(place, footage):
     change = shown[FRAMES - 1].mean() - shown[0].mean()
     assert change == pytest.approx(5 * (FRAMES - 1), abs=6)
     for number in (FRAMES, -1):
-        assert ada.get(f"{path}/{number}").status_code == 422
-    assert page_client.browser(ada.app).get(f"{path}/0").status_code == 401
+        assert ada.get(f"{path}/{number}?fps={FPS}").status_code == 422
+    assert page_client.browser(ada.app).get(f"{path}/0?fps={FPS}").status_code == 401
+
+
+def test_frames_are_counted_by_the_clock_of_the_camera(place, tmp_path):
+    """A recorder left out frames 4 to 7: frame 9 stays frame 9, and 5 shows the nearest image."""
+    file, levels = tmp_path / "camera.mp4", [0, 1, 2, 3, *range(8, 12)]
+    with av.open(str(file), "w") as container:
+        stream = container.add_stream("libx264", rate=FPS)
+        stream.width, stream.height = SIZE
+        for level in levels:
+            image = np.full((SIZE[1], SIZE[0], 3), 20 * level, dtype=np.uint8)
+            picture = av.VideoFrame.from_ndarray(image, format="rgb24")
+            picture.pts, picture.time_base = level, Fraction(1, FPS)
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode(None))
+    draft, view = upload(ada := open_pages(place), file)
+    path = f"{DRAFTS}/{draft}/files/{view['files'][0]['id']}/frames"
+    assert view["files"][0]["seconds"] == pytest.approx(11 / FPS)
+    for number, fps, level in ((9, FPS, 9), (5, FPS, 3), (7, FPS, 8), (18, 2 * FPS, 9)):
+        answer = ada.get(f"{path}/{number}?fps={fps}")
+        shown = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR)
+        assert shown.mean() == pytest.approx(20 * level, abs=5), number
+    for wrong in (f"12?fps={FPS}", "0?fps=0", "0?fps=nan", "1?fps=inf"):
+        assert ada.get(f"{path}/{wrong}").status_code == 422, wrong
+
+
+def test_a_form_that_another_person_changed_is_not_finished_unseen(place, footage):
+    draft, view = upload(ada := open_pages(place), footage)
+    seen = save(ada, view, a_match(view["files"][0]["name"])).json()["revision"]
+    save(ada, ada.get(f"{DRAFTS}/{draft}").json(), a_match(view["files"][0]["name"], match_id="x"))
+    answer = ada.post(f"{DRAFTS}/{draft}/finish", json={"revision": seen})
+    assert (answer.status_code, answer.json()["detail"][:12]) == (409, "another page")
+    add(ada, draft, "pitch.json", b"{}")  # a file is no other form
+    answer = ada.post(f"{DRAFTS}/{draft}/finish", json={"revision": seen + 1})
+    assert answer.json() == {"arrived": "x"}
 
 
 def test_an_interrupted_copy_continues_after_a_restart(place, footage):
@@ -481,19 +517,10 @@ def test_a_file_of_another_tool_replaces_none(tiny, tmp_path, names, expected):
     for name in names:
         source = tiny / "detections" / "cam00.npz"
         if name.endswith(".toml"):
-            camera = CameraCalibration(
-                id="cam00",
-                image_size=(1920, 1080),
-                focal_px=(1500.0, 1500.0),
-                principal_point_px=(960.0, 540.0),
-                distortion=(0.0,) * 5,
-                rotation=((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
-                translation=(0.0, 10.0, 50.0),
-            )
             source = folder / name
-            write_calibration_toml(source, {"cam00": camera})
+            write_calibration_toml(source, {"cam00": calibration("cam00")})
         shutil.copy(source, given / name)
     before = {file: file.read_bytes() for file in folder.glob("*.toml")}
     with pytest.raises(InputError, match=expected):
-        take_given(given, folder, {})
+        take_given(Store.open_or_new(tmp_path / "store"), given, folder, {})
     assert {file: file.read_bytes() for file in folder.glob("*.toml")} == before

@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import page_client
@@ -13,6 +14,7 @@ from command_line import TINY, succeed, worldpose
 from page_client import MATCH
 
 from flows.registering import open_match
+from flows.web.calibration import Pictures
 from worldpose.formats.release_cameras import read_camera
 from worldpose.ingest.footage import write_still
 from worldpose.pitch.template import PitchTemplate
@@ -53,6 +55,18 @@ def middle_of_the_pitch():
         SIZE,
     )
     return render_pitch(camera, PITCH, None, 3)
+
+
+def test_lines_are_sought_in_the_still_that_took_the_place_of_another(tmp_path):
+    pictures, shown = Pictures(), []
+    for version, level in (("first", 40), ("second", 200)):
+        still = tmp_path / version / "cam01.png"
+        write_still(still, np.full((48, 64, 3), level, np.uint8))
+        spec = SimpleNamespace(camera=lambda name: SimpleNamespace(width=64, height=48))
+        known = SimpleNamespace(stills={"cam01": still}, videos={}, spec=spec)
+        match = SimpleNamespace(match_id="final", folder=known)
+        shown.append(pictures.decode_image(match, "cam01", None).mean())
+    assert shown == [40, 200]
 
 
 @pytest.fixture

@@ -2,15 +2,14 @@
 
 import sys
 import time
-from datetime import UTC, datetime
 
 import cv2
 import numpy as np
 import pytest
 from command_line import TINY
 from page_client import MATCH
+from run_records import review_request
 
-from data_contracts.review import ReviewRequest
 from flows.registering import open_match
 from flows.reports.clip_video import clip_view
 from flows.running import RunRequest, run_match
@@ -115,17 +114,10 @@ def test_a_clip_is_accepted_with_its_video_and_its_figures_over_time(
     store = Store.open(str(project_copy))
     key = store.run(TINY).results["body_fitting/clip"]
     manifest = store.manifest(TINY, "body_fitting", "clip", key)
-    question = ReviewRequest(
-        id="body_fitting.clip.asked",
-        match_id=TINY,
-        run_id="0001",
-        gate="body_fitting",
-        keys={"body_fitting/clip": key},
-        contents={"body_fitting/clip": manifest.content},
-        reasons=("every result is asked about",),
-        figures=manifest.figures,
-        created_at=datetime.now(UTC),
-    )
+    unit, name = "body_fitting/clip", "body_fitting.clip.asked"
+    about = {"keys": {unit: key}, "contents": {unit: manifest.content}, "gate": "body_fitting"}
+    about |= {"reasons": ("every result is asked about",), "figures": manifest.figures}
+    question = review_request(name, match_id=TINY, **about)
     say(store, TINY, lambda journal: [question])
     path = f"{MATCH}/reviews/{question.id}"
     run = open_run(str(project_copy), TINY)
@@ -147,6 +139,10 @@ def test_a_clip_is_accepted_with_its_video_and_its_figures_over_time(
         return match
 
     monkeypatch.setattr(PageContext, "match", with_video)
+    away = frames.rename(tmp_path / "away")
+    evidence = ada.get(f"{path}/evidence").json()
+    assert (evidence["video"], evidence["tables"][-1]["rows"]) == (None, [["cam02"]])
+    away.rename(frames)  # what was drawn without the images is not kept
     evidence = ada.get(f"{path}/evidence").json()
     assert evidence["video"] == "cam02"
     assert evidence["pictures"] and evidence["tables"]
@@ -172,17 +168,8 @@ def test_a_curve_of_a_long_clip_keeps_its_least_and_largest_values_in_order():
 
 def test_evidence_is_of_the_newest_run_with_the_results_asked_about(store):
     keys = {"tracking/clip": store.run(TINY).results["tracking/clip"]}
-    request = ReviewRequest(
-        id="tracking.clip.1",
-        match_id=TINY,
-        run_id="0009",  # killed before its record was stored
-        gate="tracking",
-        keys=keys,
-        contents={},
-        reasons=(),
-        figures={},
-        created_at=datetime.now(UTC),
-    )
+    killed = "0009"  # before its record was stored
+    request = review_request("tracking.clip.1", match_id=TINY, run_id=killed, keys=keys)
     assert asked_run(store, request).record.run_id == "0001"
     gone = request.model_copy(update={"keys": {"tracking/clip": "0" * 32}})
     with pytest.raises(InputError, match="Run the match again"):

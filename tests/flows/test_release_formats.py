@@ -11,11 +11,10 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
-from run_records import StubRun
+from run_records import StubRun, match_spec
 from stand_ins import empty_store
 from typer.testing import CliRunner
 
-from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.release import EXPORT_FORMATS, EXPORT_PURPOSES, BaselineSettings
 from flows.cli.app import app
 from flows.results import best_results
@@ -88,15 +87,8 @@ def match_folder(tmp_path):
 
 
 def origin(folder, **results):
-    spec = MatchSpec(
-        match_id="m",
-        fps=50.0,
-        cameras=(
-            CameraSpec(id="north", width=1920, height=1080),
-            CameraSpec(id="main", kind="broadcast", width=1920, height=1080),
-        ),
-        clips=(ClipSpec(id="A_1", first_frame=100, frame_count=4, broadcast="main"),),
-    )
+    clips = {"A_1": {"first_frame": 100, "frame_count": 4, "broadcast": "main"}}
+    spec = match_spec({"north": {}, "main": {"kind": "broadcast"}}, clips, fps=50.0)
     named = {name.replace("__", "/"): data for name, data in results.items()}
     return Origin(StubRun(named, empty_store()), SimpleNamespace(spec=spec, folder=str(folder)))
 

@@ -3,8 +3,8 @@
 from types import SimpleNamespace
 
 import pytest
+from run_records import match_spec
 
-from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from flows.reports.report import write_report
 from worldpose.errors import UsageError
 
@@ -12,16 +12,11 @@ from worldpose.errors import UsageError
 @pytest.mark.parametrize("asked", ["south", "main", "nobody"])
 def test_a_camera_without_a_video_of_its_own_is_refused_before_anything_is_written(tmp_path, asked):
     names = {"north": "static", "south": "static", "main": "broadcast"}
-    spec = MatchSpec(
-        match_id="m",
-        fps=50.0,
-        cameras=tuple(
-            CameraSpec(id=name, kind=kind, width=1920, height=1080) for name, kind in names.items()
-        ),
-        clips=(ClipSpec(id="clip", frame_count=4, broadcast="main"),),
-    )
+    cameras = {name: {"kind": kind} for name, kind in names.items()}
+    spec = match_spec(cameras, {"clip": {"frame_count": 4, "broadcast": "main"}})
     folder = SimpleNamespace(spec=spec, videos={"north": "a.mp4", "clip": "b.mp4"})
     page = tmp_path / "report.html"
     with pytest.raises(UsageError, match=rf"--camera {asked}: .*these have one: north\."):
-        write_report(None, SimpleNamespace(folder=folder), page, camera=asked)
+        there = SimpleNamespace(folder=folder)
+        write_report(None, SimpleNamespace(at_hand=lambda: there), page, camera=asked)
     assert not page.exists()

@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+import shutil
 from html import escape
 from html.parser import HTMLParser
 from pathlib import Path
@@ -14,7 +15,7 @@ from command_line import TINY, succeed, worldpose
 
 from data_contracts.conventions import COCO17, JOINT_GROUPS
 from flows.registering import open_match
-from flows.reports import viewer
+from flows.reports import report, viewer
 from flows.reports.people import body_tables
 from flows.results.best_results import LIMB_ENDS
 from worldpose import open_run
@@ -211,3 +212,20 @@ def test_report_is_one_page_that_asks_for_nothing(tiny, tiny_run, tmp_path):
         answer = worldpose("report", tiny, "--project", tiny_run, "--no-videos", *asked)
         assert answer.code == 1 and "a file of unknown origin" in answer.err
         assert (file.read_text(), out.read_text()) == ("other", page)
+
+
+def test_a_reference_that_is_not_scored_is_said(tiny, project_copy, tmp_path, monkeypatch):
+    page, own = tmp_path / "report.html", shutil.copytree(tiny, tmp_path / "match") / "reference"
+    (own / "joints.npz").write_bytes(b"PK")
+    store = Store.open(str(project_copy))
+    there = {"folder": str(own.parent)}
+    store.register(store.registration(TINY).model_copy(update=there))
+    given = ("report", TINY, "--project", project_copy, "--no-videos", "--out", page)
+    answer = worldpose(*given)  # nobody asked for it
+    assert (answer.code, "warning: The results are not scored" in answer.err) == (0, True)
+    assert "Against the truth" in page.read_text()
+    assert worldpose(*given, "--reference", own).code == 1
+    monkeypatch.setattr(report, "find_clips", lambda record: ("first", "second"))
+    match, run = open_match(store, TINY), open_run(str(project_copy), TINY)
+    *_, said = report._against_truth(store, run, match, str(tiny / "reference"))
+    assert "the run has 2 clips" in said

@@ -1,17 +1,16 @@
 """Runs are compared, named and pinned; their units say where they come from."""
 
 import json
-from datetime import UTC, datetime
 
 import numpy as np
 import pytest
 from camera_builders import plain_camera
 from command_line import TINY
-from run_records import run_record
+from run_records import correction, match_spec, run_record
 from typer.testing import CliRunner
 
-from data_contracts.match import CameraSpec, ClipSpec, MatchSpec, Registration, SourceFile
-from data_contracts.review import Correction, DeletedDetection, MovedPoint
+from data_contracts.match import Registration, SourceFile
+from data_contracts.review import DeletedDetection, MovedPoint
 from flows.cli.app import app
 from flows.results import comparison
 from flows.results.comparison import BodiesOfBoth, compare_runs, pair_people
@@ -174,13 +173,8 @@ MADE_FROM = {
 
 
 def moved(camera, frame=None):
-    return Correction(
-        id=f"{camera}.{frame}",
-        match_id="m",
-        edit=MovedPoint(camera=camera, marking="corner_left_near", frame=frame, xy=(1.0, 1.0)),
-        who="Ada",
-        made_at=datetime(2026, 1, 2, tzinfo=UTC),
-        based_on={},
+    return correction(
+        MovedPoint(camera=camera, marking="corner_left_near", frame=frame, xy=(1.0, 1.0))
     )
 
 
@@ -214,9 +208,7 @@ def test_a_folders_digest_is_of_the_names_and_contents_below_it():
             SourceFile(path=path, size=1, modified_ns=1, sha256=digest)
             for path, digest in paths.items()
         ]
-        camera = CameraSpec(id="cam00", width=1920, height=1080)
-        clip = ClipSpec(id="clip", first_frame=0, frame_count=2)
-        spec = MatchSpec(match_id="m", fps=50, cameras=[camera], clips=[clip])
+        spec = match_spec(["cam00"])
         return Registration(spec=spec, folder="m", identity="b" * 64, files=listed)
 
     first = files(videos_cam00_1="1", videos_cam00_2="2", videos_cam01_1="1")

@@ -5,6 +5,7 @@ import shutil
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext, suppress
 from dataclasses import replace
+from pathlib import Path
 from threading import Barrier, BrokenBarrierError
 from types import SimpleNamespace
 
@@ -32,6 +33,7 @@ from flows.web import app_context
 from flows.web import settings as page_settings
 from worldpose.body.body_file import load_open_body, save_body
 from worldpose.errors import InputError, UsageError
+from worldpose.ingest.match_folder import read_match
 from worldpose.store.run_queue import queue_of
 from worldpose.store.store import Run, Store
 
@@ -194,11 +196,7 @@ def test_each_value_is_from_the_last_layer_that_states_it(store, tiny):
 @pytest.mark.parametrize(
     ("text", "key", "found"),
     [
-        (
-            "detection.strid: 2",
-            "detection.strid",
-            "Did you mean 'detection.stride'.*settings --list",
-        ),
+        ("detection.strid: 2", "detection.strid", "Did you mean 'detection.stride'.*settings"),
         ("detection.stride: none", "detection.stride", "'none'"),
         ("tracking.gate_m: -1", "tracking.gate_m", "-1"),
         ("iterations: many", "iterations", "many"),
@@ -233,6 +231,40 @@ def test_match_yaml_names_its_venue_and_the_venue_gives_pitch_and_side(store, ti
     assert match.folder.spec.camera(camera).side == "near"
     assert resolve(match.layers).overrides == {"tracking": {"gate_m": 0.6}}
     assert match.pitch_source["length"] == 101.0
+
+
+def test_clicks_have_the_names_of_the_venues_game(store, tiny, tmp_path):
+    folder = shutil.copytree(tiny, tmp_path / "hall")
+    (folder / "pitch.json").unlink()
+    text = yaml.safe_load((folder / "match.yaml").read_text())
+    named = {"match_id": "hall", "venue": "hall"}
+    (folder / "match.yaml").write_text(yaml.safe_dump({**text, **named}))
+    places = ("backboard_left_near_top", "free_throw_left_center", "center_mark", "halfway_near")
+    points = [{"name": name, "xy": [100.0, 100.0 + n]} for n, name in enumerate(places)]
+    camera = next(each["id"] for each in text["cameras"] if each.get("kind") != "broadcast")
+    shutil.rmtree(folder / "annotations")
+    file = folder / "annotations" / "static_calibration" / f"{camera}.json"
+    file.parent.mkdir(parents=True)
+    file.write_text(json.dumps({"contract": 1, "points": points}))
+    assert read_match(folder).clicked.keys() == {camera}  # the venue is not known here
+    for template in ("futsal", "basketball"):
+        write_layer(store, "venues/hall", {"pitch": {"template": template}})
+        with nullcontext() if template == "basketball" else pytest.raises(InputError, match="name"):
+            register(store, folder, unfinished=True)
+    again = (folder / "again.json", tmp_path / "copy")
+    shutil.copytree(folder, again[1])
+    shutil.rmtree(again[1] / "annotations")
+    categories = [{"id": 1, "name": "p", "keypoints": [*places, places[0]]}]
+    images = [{"id": 1, "file_name": f"{camera}.png", "width": 1920, "height": 1080}]
+    numbers = [n for x in range(5) for n in (100 + x, 100, 2)]
+    clicks = [{"id": 1, "image_id": 1, "category_id": 1, "keypoints": numbers}]
+    coco = {"images": images, "categories": categories, "annotations": clicks}
+    again[0].write_text(json.dumps(coco))
+    given = ("import", "--clicks", again[0], "--out", again[1], "--project")
+    command(*given, tmp_path / "other", code=1)
+    command(*given, store.url)
+    found = json.loads((again[1] / "pitch.json").read_text())
+    assert found["template"] == "basketball" and [*found["points"]] == [f"{places[0]}.again"]
 
 
 def test_the_list_has_one_short_line_per_setting_and_the_rest_by_name():
@@ -323,7 +355,7 @@ def test_exports_have_the_pitch_of_the_layers(store):
     registration = open_match(store, TINY).registration
     folder = registration.model_copy(update={"folder": store.url})  # without pitch.json
     write_layer(store, "project", {"pitch": {"length": 101.0, "width": 66.0}})
-    assert layers.pitch_of(store, folder).length == 101.0
+    assert layers.pitch_of(store, Path(store.url), folder.spec).length == 101.0
     # The results of a run keep the pitch that it used, in exports and in reports.
     used = open_match(store, TINY).folder.pitch
     origin = Origin(Run(store, store.run(TINY)), folder)

@@ -166,6 +166,6 @@ def test_who_takes_too_long_is_ended_and_given_up_the_second_time(work, tmp_path
             os._exit(0)
         _, status = os.waitpid(pid, 0)
         assert os.WIFSIGNALED(status)
-    with pytest.raises(TaskTimeoutError, match=r"stopped 2 times.*test_watchdog\.py"):
+    with pytest.raises(TaskTimeoutError, match=r"stopped 2 times.*test_batch\.py"):
         kill_on_timeout(hasty).__enter__()
     assert list(tmp_path.iterdir()) == []

@@ -12,11 +12,13 @@ from camera_builders import look_at_camera
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import CameraChange
 from tasks import clip_inputs, filtering, refitting
-from tasks.clip_inputs import PAGE, StoredFeedback, open_detections
+from tasks.clip_inputs import ADJUSTED, PAGE, StoredFeedback, open_detections
+from worldpose.body.body_file import find_body
 from worldpose.body_fitting.monocular import MonocularEstimates
 from worldpose.body_fitting.pose_space import GATHER
 from worldpose.detection.interfaces import ScoreMap
 from worldpose.filtering.redetection import MissingPeople
+from worldpose.filtering.systematic_errors import TERMS
 from worldpose.geometry.cameras import Camera, camera_arrays
 from worldpose.geometry.rigid import Rigid
 from worldpose.ingest.clock import ImageClock, camera_frames
@@ -104,22 +106,69 @@ class Results(dict):
     def open(self, name):
         return self[name]
 
+    def open_first(self, *names):
+        return next(self[name] for name in names if name in self)
+
 
 def test_clips_that_overlap_are_each_corrected_by_their_own_changes(monkeypatch):
     camera = Camera.stack([look_at_camera((0.0, -20.0, 5.0), (0.0, 0.0, 0.0), 1500.0)])
     monkeypatch.setattr(clip_inputs, "_load_cameras", lambda *_: (camera, None, None))
-    frames = {"a": np.arange(0, 6), "b": np.arange(3, 9)}
     stored = Results()
-    for clip, frame in frames.items():
+    for clip, frame in {"a": np.arange(0, 6), "b": np.arange(3, 9)}.items():
         given = {"first_frame": frame[0], "frame_count": 6, "shift_px": (40.0, 0.0), "std": 0.1}
         change = CameraChange(camera="cam", kind="view", frame=4, **given)
         stored[f"tracking/{clip}"] = SimpleNamespace(attrs={"changes": [change.model_dump()]})
-    correct = clip_inputs._view_corrector(stored, frames)
-    middle = np.asarray(camera.principal_point[0], np.float32)
-    seen = np.tile(middle, (12, 1, 1, 1, 1))
-    moved = (correct(seen, slice(0, 12)) - seen)[:, 0, 0, 0, 0]
-    knocked = np.concatenate(list(frames.values())) >= 4
-    np.testing.assert_allclose(moved, -40.0 * knocked, atol=0.1)
+        correct = clip_inputs._view_corrector(stored, clip, frame, ())
+        middle = np.asarray(camera.principal_point[0], np.float32)
+        seen = np.tile(middle, (6, 1, 1, 1, 1))
+        moved = (correct(seen, slice(0, 6)) - seen)[:, 0, 0, 0, 0]
+        np.testing.assert_allclose(moved, -40.0 * (frame >= 4), atol=0.1)
+
+
+@pytest.fixture
+def late_clips(monkeypatch):
+    """Two clips of a camera a quarter of a frame early, and a person who moves 8 px per frame."""
+    monkeypatch.setattr(clip_inputs, "_load_cameras", lambda *_: (None, None, None))
+    stored = Results()
+    stored.sources = {"cameras": ["cam"], "fps": 25.0, "clocks": [[[[0, 0.25]], 1.0]]}
+    stored.sources |= {"clips": {"a": [0, 10], "b": [20, 4]}, "seen": {"a": ["s/a"], "b": ["s/b"]}}
+    for clip, (first, count) in stored.sources["clips"].items():
+        frame = np.arange(first, first + count)
+        seen = camera(count, 1 + (clip == "b"), np.random.default_rng(2))
+        seen["keypoints"][:, 0] = 8.0 * (frame - 0.25)[:, None, None]
+        stored[f"s/{clip}"] = seen.assign_coords(frame=frame)
+        index = array(np.zeros((count, 1, 1), np.int16), "camera", "person")
+        coordinates = {"frame": frame, "person": [3]}
+        stored[f"tracking/{clip}"] = xr.Dataset(
+            {"detection_index": index}, coordinates, {"changes": []}
+        )
+    return stored
+
+
+def test_chosen_frames_of_all_clips_are_read_at_match_time(late_clips):
+    frames = {"a": np.array([0, 3, 6, 9]), "b": np.array([20, 22])}
+    clip = clip_inputs.open_frames(late_clips, frames)
+    assert clip.detections.keypoints.shape == (6, 1, 2, 17, 2)
+    expected = 8.0 * np.array([0, 3, 6, 9, 20, 22])
+    np.testing.assert_allclose(clip.detections.keypoints[:, 0, 0, 0, 0], expected)
+    assert np.isnan(clip.detections.score[:, 0, 1]).tolist() == [True] * 4 + [False] * 2
+
+
+def test_every_iteration_is_judged_on_keypoints_at_match_time(late_clips, monkeypatch):
+    late_clips.unit, late_clips.frames = "a", np.arange(10)
+    late_clips.sources["seen"] = ["s/a"]
+    compared = []
+    monkeypatch.setattr(
+        filtering,
+        "measure_held_out",
+        lambda cameras, used, keypoints, _: compared.append(keypoints),
+    )
+    suspects = SimpleNamespace(detections=clip_inputs.open_tracked_clip(late_clips).detections[:])
+    for first in (True, False):
+        case = SimpleNamespace(first=first, clip=SimpleNamespace(cameras=None), triangulation=None)
+        filtering._held_out(late_clips, case, np.arange(10), suspects)
+    np.testing.assert_array_equal(*compared)
+    np.testing.assert_allclose(compared[1][:, 0, 0, 0, 0], 8.0 * np.arange(10))
 
 
 def test_two_frames_that_show_one_image_are_both_searched(monkeypatch):
@@ -134,6 +183,57 @@ def test_two_frames_that_show_one_image_are_both_searched(monkeypatch):
     monkeypatch.setattr(filtering, "some_pictures", lambda _, some: zip(some, some, strict=True))
     shown = dict(filtering._pictures(Results({"ingest/cam": footage}), case, frame))
     assert shown == dict(enumerate(numbers.tolist()))
+
+
+def test_people_are_looked_for_where_the_image_shows_them(late_clips):
+    frame, eye = np.arange(10), look_at_camera((0.0, -20.0, 5.0), (0.0, 0.0, 0.0), 1500.0)
+    height = np.linspace(1.8, 0.1, 17)
+
+    def body(time):
+        across = np.broadcast_to(np.tile([-0.2, 0.2], 9)[:17], (len(time), 17))
+        return np.stack([across + 0.2 * time[:, None], 0.0 * across, height + 0.0 * across], -1)
+
+    joints = body(frame)[:, None]
+    cameras = camera_arrays(Camera.stack([eye]))
+    late_clips |= {
+        "detection/s": late_clips["s/a"],
+        ADJUSTED: xr.Dataset(
+            {n: ([f"{n}{k}" for k in range(a.ndim)], a) for n, a in cameras.items()},
+            attrs={"surface": None},
+        ),
+        "body_fitting/a": xr.Dataset(
+            {
+                "joints": array(joints, "person", "joint", "axis"),
+                "covariance": array(1e-4 * np.tile(np.eye(3), (10, 1, 17, 1, 1)), *"pjab"),
+                "joint_offsets": (("joint", "axis"), np.zeros((17, 3))),
+            },
+            {"person": [3]},
+        ),
+        "retriangulation/a": xr.Dataset(
+            {
+                "common_bias": ("joint", np.zeros(17)),
+                "offsets": array(np.zeros((10, 1, 1, 2)), "camera", "person", "axis"),
+                "exchanged": array(np.zeros((10, 1, 1, 5), bool), *"cpk"),
+            }
+        ),
+        "filtering/a": xr.Dataset(
+            {
+                "view_bias": (("joint", "axis", "term"), np.zeros((17, 2, TERMS))),
+                "clock_late": ("camera", np.zeros(1)),
+                "fits": array(np.zeros((10, 1, 1), int), "camera", "detection"),
+                "dropped": array(np.zeros((10, 1, 1), bool), "camera", "detection"),
+            }
+        ),
+    }
+    late_clips["tracking/a"] = late_clips["tracking/a"].assign_coords(camera=["cam"])
+    late_clips.unit = "s"
+    late_clips.sources |= {"camera": "cam", "clip": "a"}
+    settings = SimpleNamespace(settings=lambda kind: kind(), sources=late_clips.sources)
+    late_clips.made_from = lambda name: settings
+    case = filtering._open_view(late_clips)
+    shown = eye.project(body(frame[1:-1] - 0.25).reshape(-1, 3)).reshape(8, 17, 2)
+    np.testing.assert_allclose(case.expected.image[1:-1, 0], shown, atol=0.05)
+    assert np.abs(case.shift[1:-1]).max() == 0.0  # tracking moves what is found to match time
 
 
 @pytest.mark.parametrize(("given", "turned_deg"), [(True, 0.0), (False, 90.0)])
@@ -243,3 +343,33 @@ def test_bodies_of_pictures_that_are_late_are_those_of_the_frames(late):
     np.testing.assert_allclose(found.orient[there, 0], turned(frame[there]), atol=1e-9)
     turns = frame[there, None] * np.tile([0.0, 0.0, 0.1], 23)
     np.testing.assert_allclose(found.angles[there, 0], turns @ GATHER.T, atol=1e-9)
+
+
+def test_names_give_a_shape_only_to_people_who_can_be_the_same(monkeypatch):
+    model = find_body()
+    monkeypatch.setattr(refitting, "find_same_body", lambda before: model)
+    count = model.shapes
+
+    def bodies(*first):
+        betas = np.zeros((len(first), count))
+        betas[:, 0] = first
+        covariance = np.tile(0.2 * np.eye(count), (len(first), 1, 1))
+        return xr.Dataset(
+            {
+                "betas": (("person", "beta"), betas),
+                "betas_covariance": (("person", "a", "b"), covariance),
+            },
+            {"person": np.arange(len(first))},
+        )
+
+    fitted = {"body_fitting/a": bodies(0.0, 1.0, 2.0), "body_fitting/b": bodies(1.1, -4.0)}
+    names = {"a": {"1": "kane", "2": "rice", "99": "saka"}, "b": {"0": "kane", "1": "rice"}}
+    inputs = SimpleNamespace(unit="a", sources={"people": names}, open=fitted.__getitem__)
+    before = SimpleNamespace(settings=lambda kind: SimpleNamespace(shape_weight=1.0))
+    result = SimpleNamespace(warnings=[])
+    known = refitting._known_shapes(inputs, before, fitted["body_fitting/a"], result)
+    assert list(known) == [1]
+    assert known[1].betas[0] == pytest.approx(1.1)
+    differ, missing = result.warnings
+    assert "person 2 of clip a and person 1 of clip b are both named rice and differ" in differ
+    assert missing.startswith("clip a has no fitted person 99, named saka; its people are 0, 1, 2.")

@@ -1,16 +1,16 @@
 """From a video to the match's clock: the frame that is read is the one that was shown."""
 
 from dataclasses import replace
-from datetime import UTC, datetime
 
 import av
 import numpy as np
 import pytest
 from filmed import write_filmed
+from run_records import correction
 
 import tasks.detection
 from data_contracts.keypoints import KeypointDetections
-from data_contracts.review import Correction, DeletedDetection
+from data_contracts.review import DeletedDetection
 from flows.match import task_of
 from flows.method import METHOD
 from flows.registering import register
@@ -158,14 +158,7 @@ def test_a_corrected_detection_is_the_same_whether_or_not_the_nets_look_again(
     filmed, tmp_path, reading, monkeypatch
 ):
     edit = DeletedDetection(camera="left", frame=4, detection=0)
-    said = Correction(
-        id="c1",
-        match_id="filmed",
-        edit=edit,
-        who="Ada",
-        made_at=datetime(2026, 1, 2, tzinfo=UTC),
-        based_on={},
-    )
+    said = correction(edit, match_id="filmed")
     stages = [stage.name for stage in METHOD].index("detection") + 1
     found = []
     for project in ("fresh", "kept"):

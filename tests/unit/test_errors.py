@@ -17,10 +17,11 @@ import numpy as np
 import pytest
 import run
 from registry import REGISTRY
+from run_records import match_spec
 
 import worldpose.compiled
 from data_contracts.keypoints import KeypointDetections
-from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
+from data_contracts.match import CameraSpec
 from flows.method import METHOD
 from worldpose import pipeline
 from worldpose.cache_folder import own_temporary_folder
@@ -80,6 +81,15 @@ def test_the_pipeline_has_the_order_of_the_method():
     assert order == [stage.name for stage in METHOD if stage.name in order]
 
 
+def test_the_pipeline_calibrates_with_a_given_lens(monkeypatch):
+    camera = CameraSpec(id="a", width=64, height=48)
+    monkeypatch.setattr(pipeline, "calibrate_camera", lambda *_, lens, **__: lens)
+    match = SimpleNamespace(
+        spec=SimpleNamespace(static_cameras=[camera]), clicked={"a": 1}, stills={}, lenses={"a": 2}
+    )
+    assert pipeline.calibrate_static_cameras(match, None) == [2]
+
+
 @pytest.mark.parametrize(("fps", "images"), [(25.0, [900, 919]), (50.0, [1800, 1838])])
 def test_people_of_a_video_are_placed_on_match_frames(monkeypatch, fps, images):
     """Camera b has a video; its pictures are (their number,), and so is what our nets find."""
@@ -103,13 +113,8 @@ def test_people_of_a_video_are_placed_on_match_frames(monkeypatch, fps, images):
         frame = np.arange(len(shown))
         return KeypointDetections.from_keypoints(points, points[..., 0] > 0, frame=frame)
 
-    size = {"width": 64, "height": 48}
-    spec = MatchSpec(
-        match_id="m",
-        fps=25.0,
-        cameras=[CameraSpec(id="a", **size), CameraSpec(id="b", fps=fps, **size)],
-        clips=[ClipSpec(id="c", first_frame=900, frame_count=20)],
-    )
+    clips = {"c": {"first_frame": 900, "frame_count": 20}}
+    spec = match_spec({"a": {}, "b": {"fps": fps}}, clips, (64, 48))
     given = find(range(900, 920))
     monkeypatch.setattr(pipeline, "open_video", lambda _: Video())
     monkeypatch.setattr(pipeline, "pictures_at", read)

@@ -51,8 +51,9 @@ def read_monocular(path: Path) -> MonocularEstimates:
     Rotations are axis-angle vectors or matrices, in one array (`pred_thetas`, `poses`, ...) or two
     (`global_orient` and `body_pose`). The position of a body comes from its crop (`box_center`,
     `bbox`: weak perspective, whose scale and offset are not needed) or from its position in front
-    of the camera (`transl` with `focal_length` and `img_size`: full perspective). `frame` gives the
-    rows' frames; without it each row is a frame of its own.
+    of the camera (`transl` with `focal_length` and `img_size`: full perspective). Boxes are
+    centers, or x0 y0 x1 y1 with or without a score, or VIBE's `bboxes` with `frame_ids`: center,
+    width and height. `frame` gives the rows' frames; without it each row is a frame of its own.
 
     Args:
         path: written by `numpy.savez`; save the arrays of a pickle this way.
@@ -94,13 +95,16 @@ def parse_monocular(arrays: Mapping[str, NDArray[Any]], where: Path) -> Monocula
     else:
         rotations = _rotation_matrices(whole, where, "rotations", JOINTS)
     rows = len(rotations)
-    frame = np.asarray(arrays.get("frame", arrays.get("frames", np.arange(rows)))).ravel()
-    # Crops have centers, or x0 y0 x1 y1; whole images positions in front of the camera [m].
+    frame = _first_present(arrays, ("frame", "frames", "frame_ids"))
+    frame = np.arange(rows) if frame is None else frame.ravel()
+    if frame.dtype.kind not in "iuf" or (frame != np.rint(frame)).any() or np.isinf(frame).any():
+        raise _format_error(where, "whole frame numbers", f"others among {len(frame)}")
+    # Crops have centers or boxes; whole images positions in front of the camera [m].
     crop = _first_present(arrays, ("box_center", "bbox", "bboxes"))
     place = _first_present(arrays, ("transl", "pred_cam_t_full", "cam_t", "trans"))
     if crop is not None:
-        crop = np.asarray(crop, dtype=np.float64)
-        center = crop if crop.shape[1:] == (2,) else 0.5 * (crop[..., :2] + crop[..., 2:4])
+        is_vibe = "frame_ids" in arrays and crop is arrays.get("bboxes")
+        center = _box_centers(np.asarray(crop, dtype=np.float64), where, is_vibe)
     elif place is not None and "focal_length" in arrays and "img_size" in arrays:
         focal = np.broadcast_to(np.asarray(arrays["focal_length"]).reshape(-1, 1), (rows, 1))
         size = np.broadcast_to(np.asarray(arrays["img_size"]).reshape(-1, 2), (rows, 2))
@@ -121,6 +125,17 @@ def _first_present(
     arrays: Mapping[str, NDArray[Any]], names: tuple[str, ...]
 ) -> NDArray[Any] | None:
     return next((arrays[name] for name in names if name in arrays), None)
+
+
+def _box_centers(boxes: Floats, where: Path, is_vibe: bool) -> Floats:
+    """Return centers (rows, 2) [px] of centers or boxes; VIBE has center, width and height."""
+    width = boxes.shape[1] if boxes.ndim == 2 else 0
+    if width == 2 or (width == 4 and is_vibe):
+        return boxes[:, :2]
+    if width not in (4, 5) or (boxes[:, 2:4] < boxes[:, :2]).any():  # NaN: no box
+        expected = "centers, or boxes x0 y0 x1 y1 with or without a score, x1 >= x0 and y1 >= y0"
+        raise _format_error(where, expected, f"shape {boxes.shape} or other corners")
+    return 0.5 * (boxes[:, :2] + boxes[:, 2:4])
 
 
 def _rotation_matrices(given: NDArray[Any], where: Path, name: str, joints: int) -> Floats:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats
 from worldpose.body.model import BODY_POSE, BodyModel, BodyParameters
-from worldpose.body_fitting.evidence import body_axes
+from worldpose.body_fitting.evidence import body_axes, random_covariance
 from worldpose.body_fitting.monocular import MonocularPoses
 from worldpose.body_fitting.poses import PoseSolver
 from worldpose.body_fitting.ray_constraints import RayConstraints
@@ -49,7 +49,8 @@ class ClipEvidence:
         joints: (frames, persons, 17, 3) [m], world, COCO-17; NaN where missing.
         covariance: (frames, persons, 17, 3, 3) [m^2], of `joints`.
         fps: [1/s].
-        common_bias: (17,) per axis, error that all views share [m]; None = none.
+        common_bias: (17,) per axis, error that all views share [m], whose square is part of
+            `covariance`; None = none.
         ray_constraints: lines of sight of joints that are not triangulated, for the same frames and
             persons; a person without joints is present as long as these last.
         monocular_poses: poses of the same frames and persons, used where few joints are well
@@ -60,7 +61,8 @@ class ClipEvidence:
         extra: points besides COCO-17 of the same frames and persons; None = none.
 
     Raises:
-        InputError: the shapes do not match, or `fps` is not positive.
+        InputError: the shapes do not match, `fps` is not positive, or `covariance` is smaller than
+            the square of `common_bias`.
     """
 
     joints: Floats
@@ -84,6 +86,17 @@ class ClipEvidence:
                 todo="Give triangulated joints with their covariance.",
             )
         row_rate("body fitting", self.fps)
+        left = random_covariance(self.covariance, self.bias)[self.joint_seen]
+        total = np.trace(self.covariance[self.joint_seen], axis1=-2, axis2=-1)
+        # Numbers of a file are rounded to float32.
+        short = np.linalg.eigvalsh(left)[:, 0] < -1e-6 * total
+        if short.any():
+            raise InputError(
+                "body fitting: common_bias",
+                expected="an error [m] whose square is part of the covariance of each joint",
+                found=f"{self.bias.max():g}, more than the covariance of {short.sum()} joints",
+                todo="Add its square to the diagonal of covariance, or give no common_bias.",
+            )
 
     @staticmethod
     def of(placed: Triangulation, fps: float, rays: RayConstraints) -> ClipEvidence:

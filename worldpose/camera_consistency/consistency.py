@@ -90,8 +90,8 @@ def _judge_most(
     """Return the result without faults of single cameras if most cameras fit no other one.
 
     A correction that lets a camera agree with others speaks for them. Else their calibration is
-    another match's, or their world has another unit or axis, in which people still lie on each
-    other's epipolar lines.
+    another match's, where people meet by chance alone, or their world has another unit or axis, in
+    which people still lie on each other's epipolar lines.
     """
     share = found.agreement / np.maximum(1.0, np.minimum(seen[:, None], seen))
     judged = np.flatnonzero(seen >= 0.5)
@@ -102,13 +102,28 @@ def _judge_most(
     rays = usable_rays(cameras, detections, MIN_JOINTS)
     agree = np.zeros(len(seen), dtype=np.bool_)
     for pair in itertools.combinations(judged.tolist(), 2):
-        if match_pair(cameras, rays, pair, 0, MIN_JOINTS).agrees:
-            agree[list(pair)] = True
+        agree[list(pair)] |= not _is_by_chance(cameras, rays, pair)
     alone = tuple(judged[~agree[judged]].tolist())
     every = tuple(range(len(seen)))
     return Consistency(
         (), (), every, found.agreement, alone if 2 * len(alone) > len(judged) else ()
     )
+
+
+def _is_by_chance(cameras: Camera, rays: Floats, pair: tuple[int, int]) -> bool:
+    """Return whether the people of two cameras clearly meet no more often than by chance.
+
+    By chance they meet at other moments of the clip too. Cameras share a part of their views, so
+    that few can meet at all. From low cameras, or where people stand still, chance is high and
+    tells nothing.
+    """
+    tells = 0.06  # share by chance below which it tells [1]
+    least = 0.05  # of a clear difference between shares [1]
+    now = match_pair(cameras, rays, pair, 0, MIN_JOINTS)
+    shifts = (len(rays) * np.array([-3, -2, -1, 1, 2, 3])) // 6
+    chance = [match_pair(cameras, rays, pair, s, MIN_JOINTS).share for s in shifts.tolist()]
+    above = now.share - np.mean(chance) > max(least, 3.0 * float(np.std(chance)))
+    return not (now.agrees or (above and now.count >= 4) or np.mean(chance) > tells)
 
 
 def select_busiest_frames(confidence: ClipArray, longest: int) -> slice:

@@ -218,6 +218,8 @@ def _check_markers(
     path: Path, rate: float, names: tuple[str, ...], points: Floats, unit: str
 ) -> Markers:
     unit = UNIT_NAMES.get(unit, unit)
+    if len(points) == 0:
+        raise _wrong(path, "samples of markers", "none")
     if unit not in METRES or not rate > 0.0 or len(names) != points.shape[1]:
         raise _wrong(
             path,

@@ -11,6 +11,7 @@ import numpy as np
 from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.evaluation import Evaluation
 from data_contracts.records import Record
+from worldpose.errors import InputError
 from worldpose.evaluation.matching import (
     EvaluationSettings,
     identity_scores,
@@ -287,12 +288,21 @@ def evaluate_joints(
             do not project there; None = around the joints.
 
     Raises:
-        InputError: camera and reference have different numbers of frames, or `fps` is not
-            positive.
+        InputError: camera and reference have different numbers of frames, `fps` is not positive,
+            or no frame of the prediction is one of the reference.
     """
     settings = settings or EvaluationSettings()
     if fps is not None:
         row_rate("evaluate_joints", fps)
+    sides = prediction.frames, reference.frames
+    if all(map(len, sides)) and not np.isin(sides[0], sides[1]).any():
+        own, wanted = (f"{frames.min()} to {frames.max()}" for frames in sides)
+        raise InputError(
+            "frames of the prediction",
+            expected=f"match frames of the reference, which has some of {wanted}",
+            found=f"{own}, none in common",
+            todo="Name the prediction of the same clip, or number both sides by match frames.",
+        )
     people = select_frames(prediction.joints, prediction.frames, reference.frames)
     distances = joint_distances(people, reference.joints)
     match = match_people(distances, settings.match_gate_m)

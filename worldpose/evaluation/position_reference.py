@@ -47,7 +47,12 @@ def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float
             rate = rate if rate <= 240.0 else np.nan  # times are in minutes or the like
         if {"person", "x", "y"} <= {*table}:
             named = "name" in table and table["name"].notna().all()
-            table = table.pivot(columns="name" if named else "person", values=["x", "y"])
+            who = table["name" if named else "person"]
+            # Two people of one name differ by their ids; pieces of one track may share a name.
+            twice = who[who.groupby([who.index, who]).transform("size") > 1]
+            whole = who.astype(str) + " " + table["person"].astype(str)
+            table["who"] = who.where(~who.isin(twice), whole)
+            table = table.pivot(columns="who", values=["x", "y"])
             table.columns = [f"{name}_{axis}" for axis, name in table.columns]
         names = tuple(
             name

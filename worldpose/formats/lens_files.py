@@ -417,8 +417,6 @@ def _lens(
     where: str, name: str, table: Mapping[str, Any], size: tuple[int, int]
 ) -> LensCalibration:
     """Return the lens of a table at the size of the camera's images."""
-    # Largest difference of fx and fy of square pixels [1]; their mean is used.
-    max_aspect_error = 0.02
     # The same of the image corner's displacement, relative to its distance from the centre
     # [1]: boards seldom reach the corners.
     distortion_std = 0.005
@@ -428,13 +426,8 @@ def _lens(
     focal_std = 0.01
     optics = read_optics(where, table)
     require_optics(where, optics.size, optics.focal, optics.principal_point)
-    fx, fy = optics.focal.tolist()
-    if abs(fx - fy) > max_aspect_error * fx:
-        raise calibration_error(
-            f"{where}.matrix", "fx and fy of square pixels, within 2 %", f"{fx:g} and {fy:g}"
-        )
     scale = _scale(where, optics.size, size)
-    focal = 0.5 * (fx + fy) * scale
+    focal = square_focal(optics.focal.tolist(), where)[0] * scale
     # Pixel centres are whole numbers, so that the image's corner is at -0.5.
     middle = (optics.principal_point + 0.5) * scale - 0.5
     deviations = {
@@ -464,6 +457,20 @@ def _lens(
 
     Camera.from_lens(lens).require_rays(where)
     return lens
+
+
+def square_focal(focal: Sequence[float], where: str) -> tuple[float, float]:
+    """Return the mean of fx and fy [px], and half their difference.
+
+    Raises:
+        InputError: they differ too much for square pixels.
+    """
+    fx, fy = focal
+    if abs(fx - fy) > 0.02 * fx:
+        raise calibration_error(
+            f"{where}.matrix", "fx and fy of square pixels, within 2 %", f"{fx:g} and {fy:g}"
+        )
+    return 0.5 * (fx + fy), 0.5 * abs(fx - fy)
 
 
 def _deviation(

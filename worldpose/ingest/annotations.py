@@ -37,7 +37,7 @@ def key_frames_file(clip_id: str) -> str:
 
 
 def read_clicked(
-    folder: Path, spec: MatchSpec, pitch: PitchSpec | None
+    folder: Path, spec: MatchSpec, pitch: PitchSpec | None, *, named: bool = True
 ) -> dict[str, ClickedMarkings]:
     """Return the clicks of the static cameras of a match folder, in their order.
 
@@ -45,6 +45,7 @@ def read_clicked(
         folder: the match folder.
         spec: its match.yaml.
         pitch: its pitch; None without a pitch.
+        named: whether the names must be the pitch's; False while that of the venue is unknown.
 
     Raises:
         InputError: a file belongs to no static camera, or is invalid.
@@ -54,12 +55,12 @@ def read_clicked(
     of_cameras = "<camera>.json of a static camera"
     files = files_by_unit(folder, CLICKED_FOLDER, (".json",), static, of_cameras, alone=True)
     for name, file in files.items():
-        clicked[name] = read_clicked_markings(file, static[name], pitch)
+        clicked[name] = read_clicked_markings(file, static[name], pitch, named=named)
     return {name: clicked[name] for name in static if name in clicked}
 
 
 def read_clicked_markings(
-    file: Path, camera: CameraSpec, pitch: PitchSpec | None
+    file: Path, camera: CameraSpec, pitch: PitchSpec | None, *, named: bool = True
 ) -> ClickedMarkings:
     """Return the clicks in one camera's image.
 
@@ -67,25 +68,29 @@ def read_clicked_markings(
         file: JSON, a `ClickedMarkings`.
         camera: the camera; all clicks must be inside its image.
         pitch: the match's pitch; its template defines the names.
+        named: as in `read_clicked`.
 
     Raises:
         InputError: the file is not JSON, or has an unknown key or name, no number, a repeated name,
             a pixel outside the image, or no clicks, or the match has no pitch; the error names file
             and entry.
     """
-    template = _template(file, pitch)
+    template = _template(file, pitch, named)
     clicked = validate_record(ClickedMarkings, read_json(file), str(file))
     _require_markings(str(file), "", clicked, camera, template)
     return clicked
 
 
-def read_key_frames(folder: Path, spec: MatchSpec, pitch: PitchSpec | None) -> dict[str, KeyFrames]:
+def read_key_frames(
+    folder: Path, spec: MatchSpec, pitch: PitchSpec | None, *, named: bool = True
+) -> dict[str, KeyFrames]:
     """Return the clicked key frames by broadcast view, in the order of the clips.
 
     Args:
         folder: the match folder.
         spec: its match.yaml.
         pitch: its pitch; None without a pitch.
+        named: as in `read_clicked`.
 
     Raises:
         InputError: a file belongs to no clip with a broadcast camera, or is invalid.
@@ -95,7 +100,7 @@ def read_key_frames(folder: Path, spec: MatchSpec, pitch: PitchSpec | None) -> d
     files = files_by_unit(folder, KEY_FRAMES_FOLDER, (".json",), views, of_clips, alone=True)
     for name, file in files.items():
         camera = views[name].camera
-        template = _template(file, pitch)
+        template = _template(file, pitch, named)
         key_frames = validate_record(KeyFrames, read_json(file), str(file))
         numbers = [key_frame.frame for key_frame in key_frames.key_frames]
         if numbers != sorted(set(numbers)):
@@ -109,16 +114,20 @@ def read_key_frames(folder: Path, spec: MatchSpec, pitch: PitchSpec | None) -> d
     return {name: picked[name] for name in views if name in picked}
 
 
-def _template(file: Path, pitch: PitchSpec | None) -> PitchTemplate:
+def _template(file: Path, pitch: PitchSpec | None, named: bool) -> PitchTemplate | None:
     if pitch is None:
         expected = "no clicked markings where match.yaml says `pitch: none`"
         todo = "Remove it, or take `pitch: none` out of match.yaml."
         raise InputError(str(file), expected, "a file of them", todo)
-    return PitchTemplate.from_spec(pitch)
+    return PitchTemplate.from_spec(pitch) if named else None
 
 
 def _require_markings(
-    file: str, within: str, clicked: ClickedMarkings, camera: CameraSpec, template: PitchTemplate
+    file: str,
+    within: str,
+    clicked: ClickedMarkings,
+    camera: CameraSpec,
+    template: PitchTemplate | None,
 ) -> None:
     """Raise InputError for unknown markings, and for pixels outside the image."""
     if not (clicked.points or clicked.drawn):
@@ -131,8 +140,8 @@ def _require_markings(
     drawn = [
         (f"{dot}drawn[{n}]", marking.name, marking.xy) for n, marking in enumerate(clicked.drawn)
     ]
-    _require_known(file, points, "a point", template.points)
-    _require_known(file, drawn, "a marking", template.marking_names)
+    _require_known(file, points, "a point", None if template is None else template.points)
+    _require_known(file, drawn, "a marking", None if template is None else template.marking_names)
     for place, _, (pixel,) in points:
         _require_inside(f"{file}: {place}.xy", pixel, camera)
     for place, _, along in drawn:
@@ -144,12 +153,12 @@ def _require_known(
     file: str,
     entries: Sequence[tuple[str, str, Sequence[Pixel]]],
     kind: str,
-    known: Collection[str],
+    known: Collection[str] | None,
 ) -> None:
     """Raise InputError for unknown and for repeated names."""
     places: dict[str, str] = {}
     for place, name, _ in entries:
-        if name not in known:
+        if known is not None and name not in known:
             close = get_close_matches(name, known, n=1)
             expected = f"the name of {kind} of the pitch"
             todo = f"Did you mean {close[0]!r}?" if close else f"Known: {', '.join(known)}."

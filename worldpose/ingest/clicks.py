@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path, PurePosixPath
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
@@ -28,12 +28,15 @@ from worldpose.formats.annotations.marked_images import (
 from worldpose.formats.files import whole_file
 from worldpose.ingest.annotations import clicked_file, key_frames_file
 from worldpose.ingest.match_folder import read_spec
-from worldpose.ingest.pitch_file import read_pitch, refuse_unread_pitch
+from worldpose.ingest.pitch_file import pitch_file, read_pitch, refuse_unread_pitch
 from worldpose.pitch.laws import prescribed_points
 from worldpose.pitch.template import PitchTemplate
 
 COORDINATES: Final = re.compile(r"\(?\s*(-?\d+(?:\.\d+)?)\s*[,;_ ]\s*(-?\d+(?:\.\d+)?)\s*\)?")
 """A label that is a place, such as `(16.5, 13.84)` [m]."""
+SNAP_M: Final = 0.1
+"""A place closer to a known point than this is that point [m]: labels are rounded."""
+Place: TypeAlias = tuple[float, float] | tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,8 @@ class ImportedClicks:
     Attributes:
         files: written, relative to the match folder.
         clicks: number of clicks and drawn lines, by camera or clip.
-        own_points: points that the rules do not name, with their places (3,) [m, world].
+        own_points: points that the rules do not name, with their places [m, world]: x, y of a
+            point on the surface, x, y, z of a copy of a point whose height is known.
         repeated: labels that were clicked more than once in one image.
         notes: sentences about what was left out.
         mirrored: whether the labels' y axis points towards the near side; None without coordinates.
@@ -70,18 +74,21 @@ class ImportedClicks:
 
     files: list[str] = field(default_factory=list)
     clicks: dict[str, int] = field(default_factory=dict)
-    own_points: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    own_points: dict[str, Place] = field(default_factory=dict)
     repeated: list[RepeatedClick] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     mirrored: bool | None = None
 
 
-def import_clicks(file: Path, folder: Path, owner: str | None = None) -> ImportedClicks:
+def import_clicks(
+    file: Path, folder: Path, owner: str | None = None, pitch: PitchSpec | None = None
+) -> ImportedClicks:
     """Write the labelled points of an annotation file into a match folder.
 
     Labels are names of the pitch template or SoccerNet's of lines, without regard to case and
     spaces, or places in metres: from a corner along the touch line
-    and the goal line, or, if some are negative, from the centre spot. On which side y is positive
+    and the goal line, or, if some are negative or clearly more of them are points of the pitch
+    then, from the centre spot. On which side y is positive
     follows from the clicks: no camera above a pitch sees it mirrored. Places that neither the Laws
     nor pitch.json name become points of pitch.json. A label that is clicked twice in one image
     gives two points at one place, from which calibration tells the wrong one.
@@ -91,13 +98,15 @@ def import_clicks(file: Path, folder: Path, owner: str | None = None) -> Importe
         folder: the match folder, with match.yaml.
         owner: the static camera, or the broadcast view whose key frames are numbered by the images'
             names; None: the images are named after cameras.
+        pitch: the match's pitch; None = the folder's or the standard one.
 
     Raises:
         InputError: the file has another form; a label is unknown; an image belongs to no camera, or
-            has another size; or clicks exist already.
+            has another size; clicks exist already; or places depend on a venue's unknown pitch.
     """
     spec = read_spec(folder)
-    pitch = read_pitch(folder, spec)
+    is_unknown = pitch is None and spec.venue is not None and pitch_file(folder, spec) is None
+    pitch = pitch or read_pitch(folder, spec)
     if pitch is None:
         expected = "a pitch, whose markings were clicked"
         todo = "Remove the line `pitch: none`."
@@ -127,6 +136,10 @@ def import_clicks(file: Path, folder: Path, owner: str | None = None) -> Importe
         if (folder / name).exists():
             todo = "Move it away, or correct single clicks on the pages."
             raise InputError(str(folder / name), "no clicks there yet", "a file", todo)
+    if is_unknown and (report.own_points or report.mirrored is not None):
+        found = "labels with places, or clicked twice, whose points depend on it"
+        todo = "Give the project that has the venue (--project), or add pitch.json."
+        raise InputError(str(file), f"the pitch of venue {spec.venue!r}", found, todo)
     if report.own_points:
         refuse_unread_pitch(folder)
         known = dict(pitch.points)
@@ -231,7 +244,7 @@ class _Labels:
         self._known = {
             name: place[:2] for name, place in self._template.points.items() if name not in above
         }
-        self._frame = _label_frame(file, images, pitch)
+        self._frame = _label_frame(file, images, pitch, [*self._known.values()], report.notes)
         if self._frame is not None:
             report.mirrored = bool(self._frame[1, 1] < 0)
 
@@ -262,15 +275,14 @@ class _Labels:
         lines = [{"name": name, "xy": xy} for name, xy in drawn.items()]
         return ClickedMarkings.model_validate({"points": points, "drawn": lines})
 
-    def _place(self, name: str) -> tuple[float, float, float]:
+    def _place(self, name: str) -> Place:
         if name in self._report.own_points:
             return self._report.own_points[name]
         x, y, z = map(float, self._template.points[name])
-        return (x, y, z)
+        is_on_surface = name in self._known and name not in self._template.leveled
+        return (x, y) if is_on_surface else (x, y, z)
 
     def _name(self, image: MarkedImage, label: str) -> str:
-        # A place closer to a known point than this is that point [m]: labels are rounded.
-        snap_m = 0.1
         known = _find_name(label, self._template.points)
         if known is not None:
             return known
@@ -281,11 +293,10 @@ class _Labels:
         if abs(x) > 0.5 * self._pitch.length + 30.0 or abs(y) > 0.5 * self._pitch.width + 30.0:
             raise self._unknown(image, label, self._template.points)
         for name, place in self._known.items():
-            if np.hypot(*(place - [x, y])) < snap_m:
+            if np.hypot(*(place - [x, y])) < SNAP_M:
                 return name
         name = f"at_{x:.2f}_{y:.2f}"
-        height = float(self._template.height(np.array(x), np.array(y)))
-        self._report.own_points[name] = (round(x, 4), round(y, 4), round(height, 4))
+        self._report.own_points[name] = (round(float(x), 4), round(float(y), 4))
         return name
 
     def _line(self, image: MarkedImage, label: str) -> str:
@@ -316,8 +327,18 @@ def _find_name(label: str, names: Collection[str]) -> str | None:
     return found[0] if len(found) == 1 else None
 
 
-def _label_frame(file: Path, images: Sequence[MarkedImage], pitch: PitchSpec) -> Floats | None:
-    """Return the transformation (2, 3) of the labels' places to the world [m]; None without any."""
+def _label_frame(
+    file: Path,
+    images: Sequence[MarkedImage],
+    pitch: PitchSpec,
+    known: Sequence[Floats],
+    notes: list[str],
+) -> Floats | None:
+    """Return the transformation (2, 3) of the labels' places to the world [m]; None without any.
+
+    Places without a negative number are from a corner, unless clearly more of them are then points
+    of the pitch, `known` [m], if they are from the centre spot: a camera can see one quadrant.
+    """
     import cv2  # imported here: most imports need no homography
 
     given = []
@@ -346,9 +367,20 @@ def _label_frame(file: Path, images: Sequence[MarkedImage], pitch: PitchSpec) ->
         told = "too few" if not signs else "images that contradict each other"
         todo = "Label the clicks by the names of the pitch template instead."
         raise InputError(f"{file}: labels with places", expected, told, todo)
-    mirrored = signs[0] > 0
-    shift = np.array([0.5 * pitch.length, 0.5 * pitch.width]) if from_corner else np.zeros(2)
-    frame = np.array([[1.0, 0.0, -shift[0]], [0.0, 1.0, -shift[1]]])
-    if mirrored:
-        frame[1] = -frame[1]
-    return frame
+    side = -1.0 if signs[0] > 0 else 1.0  # of y, -1 = mirrored
+    half = np.array([0.5 * pitch.length, 0.5 * pitch.width])
+    frames = [np.array([[1.0, 0.0, -x], [0.0, side, -side * y]]) for x, y in (half, np.zeros(2))]
+    places = np.unique(places, axis=0)
+    apart = [
+        np.linalg.norm((places @ each[:, :2].T + each[:, 2])[:, None] - known, axis=-1)
+        for each in frames
+    ]
+    corner, center = (int((each.min(axis=1) < SNAP_M).sum()) for each in apart)
+    if from_corner and center < corner + 2:
+        return frames[0]
+    if from_corner:
+        notes.append(
+            f"places are from the centre spot: {center} of {len(places)} are points of the pitch "
+            f"then, and {corner} if they are from a corner"
+        )
+    return frames[1]

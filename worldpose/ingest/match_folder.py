@@ -25,7 +25,7 @@ from worldpose.ingest.annotations import (
     read_clicked,
     read_key_frames,
 )
-from worldpose.ingest.pitch_file import read_pitch
+from worldpose.ingest.pitch_file import pitch_file, read_pitch
 from worldpose.ingest.validation import (
     existing_file,
     files_by_unit,
@@ -125,12 +125,16 @@ class MatchFolder:
         return tuple(name for name in self.spec.broadcast_views if name in known)
 
 
-def read_match(folder: str | os.PathLike[str], known: Container[str] = ()) -> MatchFolder:
+def read_match(
+    folder: str | os.PathLike[str], known: Container[str] = (), pitch: PitchSpec | None = None
+) -> MatchFolder:
     """Return the validated content of a match folder, without opening videos, stills, detections.
 
     Args:
         folder: contains match.yaml and the files that it names.
         known: paths in the folder of videos that may be gone, as their results are at hand.
+        pitch: that of the settings, whose names clicks have; None = the folder's or the standard
+            one. Of a venue of match.yaml without pitch.json, names are checked with `pitch` alone.
 
     Raises:
         InputError: the folder is unreadable (its disk is not mounted, or this user has no
@@ -139,7 +143,7 @@ def read_match(folder: str | os.PathLike[str], known: Container[str] = ()) -> Ma
     """
     folder = Path(folder)
     with reachable(folder):
-        return _read_match(folder, known)
+        return _read_match(folder, known, pitch)
 
 
 def read_spec(folder: Path) -> MatchSpec:
@@ -163,7 +167,7 @@ def _read_spec(folder: Path) -> MatchSpec:
     return validate_record(MatchSpec, read_yaml(file), str(file))
 
 
-def _read_match(folder: Path, known: Container[str]) -> MatchFolder:
+def _read_match(folder: Path, known: Container[str], clicked_on: PitchSpec | None) -> MatchFolder:
     spec = read_spec(folder)
     if not (spec.static_cameras or spec.broadcast_views):
         raise InputError(
@@ -177,6 +181,8 @@ def _read_match(folder: Path, known: Container[str]) -> MatchFolder:
     _require_one_view(folder, spec)
     _require_footage(folder, spec, detections, videos)
     pitch = read_pitch(folder, spec)
+    named = clicked_on is not None or spec.venue is None or pitch_file(folder, spec) is not None
+    clicked_on = clicked_on or pitch
     calibrations = _calibrations(folder, spec)
     return MatchFolder(
         folder=folder,
@@ -185,9 +191,9 @@ def _read_match(folder: Path, known: Container[str]) -> MatchFolder:
         detections=detections,
         pitch=pitch,
         videos=videos,
-        clicked=read_clicked(folder, spec, pitch),
+        clicked=read_clicked(folder, spec, clicked_on, named=named),
         stills=_stills(folder, spec),
-        key_frames=read_key_frames(folder, spec, pitch),
+        key_frames=read_key_frames(folder, spec, clicked_on, named=named),
         lenses=_lenses(folder, spec, calibrations),
         estimates=_estimates(folder, spec, ".npz"),
         boxes=_boxes(folder, spec, videos, detections),

@@ -13,7 +13,14 @@ from numpy.typing import ArrayLike
 from data_contracts.arrays import Floats, Integers
 from data_contracts.pitch import ArcSpec, LineSpec, PitchSpec
 from worldpose.errors import InputError
-from worldpose.pitch.laws import ENDS, SIDES, least_size, prescribed_markings, prescribed_points
+from worldpose.pitch.laws import (
+    ENDS,
+    SIDES,
+    least_size,
+    places_by_size,
+    prescribed_markings,
+    prescribed_points,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +74,8 @@ class PitchTemplate:
     leveled: frozenset[str] = frozenset()
     """Names of those with a surveyed height; the others lie on the surface."""
     assumed: frozenset[str] = frozenset()
-    """Those of `length`, `width`, `crown`, `end_fall` without a measurement: there is no surveyed
-    point, and they have the values of the standard pitch."""
+    """Those of `length`, `width`, `crown`, `end_fall` without a measurement: surveyed points do not
+    determine them, and they have the values of the standard pitch."""
 
     @classmethod
     def standard(cls) -> PitchTemplate:
@@ -113,7 +120,7 @@ class PitchTemplate:
         usual = PitchSpec(template=spec.template)
         # Floors of halls are level.
         sizes = ("length", "width", *(() if spec.is_level else ("crown", "end_fall")))
-        assumed = [name for name in sizes if getattr(spec, name) == getattr(usual, name)]
+        assumed = {name for name in sizes if getattr(spec, name) == getattr(usual, name)}
         return cls(
             length=spec.length,
             width=spec.width,
@@ -127,7 +134,7 @@ class PitchTemplate:
             spec=spec,
             surveyed=frozenset(spec.points),
             leveled=frozenset(name for name, place in spec.points.items() if len(place) == 3),
-            assumed=frozenset(() if spec.points else assumed),
+            assumed=frozenset(assumed - _measured(spec)),
         )
 
     def height(self, x: ArrayLike, y: ArrayLike) -> Floats:
@@ -422,6 +429,30 @@ def _unknown_point(where: str, name: str, points: dict[str, Floats]) -> InputErr
 PRIOR_STD_M: Final = np.array([0.1, 0.25])
 """Standard deviations of the crown about that of pitch.json, as in surveys, and of the end fall
 [m]: 0.5 m are 1 % of half the length."""
+
+
+def _measured(spec: PitchSpec) -> set[str]:
+    """Return those of length, width, crown and end fall that surveyed points of the Laws determine.
+
+    As in a survey, its frame may be rotated, shifted and tilted: points of one end say no length.
+    """
+    laws, size = prescribed_points(spec) if spec.points else {}, (spec.length, spec.width)
+    places = {name: place for name, place in spec.points.items() if name in laws}
+    x, y = np.array([place[:2] for place in places.values()]).reshape(-1, 2).T
+    longer, wider = places_by_size(spec, size, list(places))[1].T
+    one, none = np.ones(len(x)), np.zeros(len(x))
+    # Rotation, two shifts, length and width; and level, two slopes, crown and end fall.
+    plan = np.c_[[-y, one, none, -longer, none], [x, none, one, none, -wider]].T
+    leveled = np.array([len(place) == 3 for place in places.values()], dtype=np.bool_)
+    heights = np.c_[one, x, y, surface_shape(x, y, size)][leveled] / 0.03  # accuracy of paint [m]
+    found = set[str]()
+    for names, rows, prior in (
+        (("length", "width"), plan / 0.03, np.array([10.0, 1e3, 1e3, 5.0, 4.0])),
+        (("crown", "end_fall"), heights, np.array([1e3, 0.01, 0.01, *PRIOR_STD_M])),
+    ):
+        std = np.sqrt(np.diagonal(np.linalg.inv(rows.T @ rows + np.diag(prior**-2.0))))
+        found |= {name for name, known in zip(names, (std < 0.5 * prior)[3:], strict=True) if known}
+    return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -116,14 +116,15 @@ def plot_before_after(
     frame: int,
     person: int,
     *,
-    still: Image,
+    still: Image | None,
     seen: Floats,
     pitch: PitchSpec | None = None,
 ) -> bytes:
     """Return a PNG of one person, their surroundings and the markings in two camera estimates.
 
     The cameras are single; `frame` and `person` are indices in `tracks`. Crosses are detected
-    keypoints `seen` (detections, 17, 2) [px], the same in both; `still` is (height, width, 3), RGB.
+    keypoints `seen` (detections, 17, 2) [px], the same in both; `still` is (height, width, 3),
+    RGB, None = plain.
     """
     shown = after.project(tracks.joints[frame, person])
     middle = np.nan_to_num(shown[np.isfinite(shown).all(axis=-1)].mean(axis=0))

@@ -186,6 +186,7 @@ class LensFit:
         residuals: (n, 2) corner minus its projection [px].
         image: (n,) index of each corner's image.
         coverage: share of a grid of 8 x 8 fields of the image that have a corner [1].
+        bend_m: bend of the board along and across it, if it clearly explains the residuals [m].
     """
 
     lens: LensCalibration
@@ -195,6 +196,7 @@ class LensFit:
     residuals: Floats
     image: Integers
     coverage: float
+    bend_m: float = 0.0
 
     @property
     def rms_px(self) -> float:
@@ -210,7 +212,8 @@ def calibrate_lens(
     Focal length (square pixels), principal point, k1, k2, p1 and p2 are estimated by OpenCV
     (Zhang, 2000); or k1 to k4 of a fisheye, if its residuals are clearly smaller. Images whose
     corners are not on a plane, or that contradict the others, are left out. The standard deviations
-    are those of leaving out one image at a time (jackknife).
+    are those of leaving out one image at a time (jackknife). If the board is bent, which all images
+    share, they are larger by what the bend moves the lens.
 
     `views` has None where no board was found; `size` is the width and height of all images [px].
 
@@ -259,8 +262,13 @@ def calibrate_lens(
             found=f"{numbers[0]:.0f} px with a standard deviation of {std[0]:.0f} px",
             todo="Add images in which the board is tilted by 30 to 45 degrees about both axes.",
         )
+    bend, bent = _fit_bend(kept, size, model)
+    spread += (bent - numbers) ** 2
     corner = np.array([_corner_factor(each, size, model) for each in left_out])
-    corner_std = np.sqrt((count - 1) / count * ((corner - corner.mean()) ** 2).sum())
+    corner_std = np.hypot(
+        np.sqrt((count - 1) / count * ((corner - corner.mean()) ** 2).sum()),
+        _corner_factor(bent, size, model) - _corner_factor(numbers, size, model),
+    )
     # Three coefficients share the displacement of the corner.
     lens = LensCalibration(
         id=camera,
@@ -269,7 +277,7 @@ def calibrate_lens(
         principal_point_px=(float(numbers[1]), float(numbers[2])),
         distortion=tuple(numbers[3:].tolist()),
         lens_model=model,
-        focal_std_px=float(max(std[0], min_std_px)),
+        focal_std_px=float(max(np.sqrt(spread[0]), min_std_px)),
         principal_point_std_px=float(max(np.sqrt(0.5 * (spread[1] + spread[2])), min_std_px)),
         distortion_std=float(max(corner_std, 1e-4)),
     )
@@ -282,12 +290,34 @@ def calibrate_lens(
         residuals=np.concatenate(residuals),
         image=np.repeat(chosen, [len(each) for each in residuals]),
         coverage=image_coverage(pixels, size),
+        bend_m=float(np.abs(bend).max()),
     )
 
 
 def _rms(residuals: Floats) -> float:
     """Return the root mean square length of residuals (n, 2) [px]."""
     return float(np.sqrt((residuals**2).sum(axis=1).mean()))
+
+
+def _fit_bend(
+    views: Sequence[BoardView], size: tuple[int, int], model: LensName
+) -> tuple[Floats, Floats]:
+    """Return the bend (2,) of the board [m] and the lens with it; zeros unless it is clear.
+
+    The heights of its corners are z = bend . (x^2, y^2), x and y from -1 to 1 over the board.
+    """
+    clear = 0.7  # ratio of residuals with the bend and without
+    bend, step_m = np.zeros(2), 1e-3
+    flat, off = _solve(views, size, model)
+    found, now = flat, np.concatenate(off)
+    for _ in range(2):
+        moved = (_solve(views, size, model, bend + step)[1] for step in step_m * np.eye(2))
+        by_bend = np.stack([(np.concatenate(each) - now).ravel() for each in moved], axis=-1)
+        bend = bend - step_m * np.linalg.lstsq(by_bend, now.ravel(), rcond=None)[0]
+        found, after = _solve(views, size, model, bend)
+        now = np.concatenate(after)
+    is_clear = _rms(now) < clear * _rms(np.concatenate(off))
+    return (bend, found) if is_clear else (np.zeros(2), flat)
 
 
 def _choose_model(views: Sequence[BoardView], size: tuple[int, int]) -> LensName:
@@ -303,23 +333,32 @@ def _choose_model(views: Sequence[BoardView], size: tuple[int, int]) -> LensName
 
 
 def _solve(
-    views: Sequence[BoardView], size: tuple[int, int], model: LensName
+    views: Sequence[BoardView],
+    size: tuple[int, int],
+    model: LensName,
+    bend: Floats | tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Floats, list[Floats]]:
-    """Return f, cx, cy and the coefficients, and the residuals (n, 2) of each view [px]."""
+    """Return f, cx, cy and the coefficients, and the residuals (n, 2) of each view [px].
+
+    The board has a `bend` (2,) [m], as `_fit_bend` says.
+    """
     import cv2
 
-    places = [np.insert(view.places, 2, 0.0, axis=1).astype(np.float32) for view in views]
+    every = np.concatenate([view.places for view in views])
+    low, high = every.min(axis=0), every.max(axis=0)
+    shape = [(2.0 * view.places - low - high) ** 2 / (high - low) ** 2 for view in views]
+    places = [np.c_[view.places, each @ bend] for view, each in zip(views, shape, strict=True)]
     images = [view.pixels.astype(np.float32) for view in views]
     middle = 0.5 * (np.array(size) - 1.0)
     start = np.array([[max(size), 0.0, middle[0]], [0.0, max(size), middle[1]], [0.0, 0.0, 1.0]])
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_K3
     _, matrix, found, rvecs, tvecs = cv2.calibrateCamera(
-        places, images, size, start, np.zeros(5), flags=flags
+        [each.astype(np.float32) for each in places], images, size, start, np.zeros(5), flags=flags
     )
     lens = np.append(found.ravel()[:4], 0.0)
     turns = np.array([cv2.Rodrigues(each)[0] for each in rvecs])
     camera = Camera.from_matrices(matrix, lens, turns, np.reshape(tvecs, (-1, 3)), size)
-    boards = _Boards(camera, views)
+    boards = _Boards(camera, views, places)
     if model == "fisheye":
         boards = boards.fit_fisheye()
     camera = boards.camera
@@ -335,16 +374,17 @@ class _Boards:
     Attributes:
         camera: (views,) one lens, with the pose of each board.
         views: the corners.
+        places: (n, 3) of the corners of each view [m].
     """
 
     camera: Camera
     views: Sequence[BoardView]
+    places: Sequence[Floats]
 
     @cached_property
     def _seen(self) -> list[Projection]:
         return [
-            self.camera[n].project_with_jacobians(np.insert(view.places, 2, 0.0, axis=1))
-            for n, view in enumerate(self.views)
+            self.camera[n].project_with_jacobians(places) for n, places in enumerate(self.places)
         ]
 
     @property

@@ -34,6 +34,7 @@ class ClickEvidence:
         drawn_marking: (d,) indices into `markings`.
         surface: (2,) crown and end fall at these places [m].
         straight: (m,) whether the marking is a straight line on the pitch surface.
+        length: of the pitch [m].
     """
 
     points: tuple[str, ...]
@@ -48,6 +49,7 @@ class ClickEvidence:
     drawn_marking: Integers
     surface: Floats
     straight: Flags
+    length: float
 
     def select(self, points: Flags, markings: Flags) -> ClickEvidence:
         """Return the evidence restricted to some clicked points (n,) and drawn markings (m,)."""
@@ -135,6 +137,7 @@ def gather_evidence(
         straight=np.array(
             [name in pitch.lines or name in pitch.unpainted for name in pixels], dtype=np.bool_
         ),
+        length=pitch.length,
     )
 
 
@@ -221,12 +224,12 @@ def check_amount(evidence: ClickEvidence, pitch: PitchTemplate, where: str) -> N
 
 def has_enough_points(evidence: ClickEvidence) -> bool:
     """Return whether the clicked points alone can determine the camera."""
-    plan = evidence.points_world[:, :2]
-    if len(plan) < _FEWEST:
+    places = evidence.points_world
+    if len(places) < _FEWEST:
         return False
-    spread = np.linalg.svd(plan - plan.mean(axis=0), compute_uv=False)[1]
-    # Within a metre of a line, root mean square, points are collinear.
-    return bool(spread >= np.sqrt(len(plan)))
+    spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1]
+    # Within a metre of a line, root mean square, points of a football pitch are collinear.
+    return bool(spread >= np.sqrt(len(places)) * evidence.length / 105.0)
 
 
 def describe_clicks(evidence: ClickEvidence) -> str:

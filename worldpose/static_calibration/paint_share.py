@@ -13,9 +13,10 @@ from worldpose.static_calibration.line_samples import project_lines, sample_mark
 
 
 def paint_share(picture: Image, camera: Camera, pitch: PitchTemplate) -> float | None:
-    """Return the share of projected markings with a brighter ridge there than on either side [1].
+    """Return the share of projected markings with a clearer ridge there than on either side [1].
 
-    By chance it is a third. A camera that is right has 0.6 and more: people hide the rest.
+    Ridges are brighter or darker than the ground, whichever are more: halls have dark lines. By
+    chance it is a third. A camera that is right has 0.6 and more: people hide the rest.
 
     Returns:
         None if the image would show too few markings to tell.
@@ -38,6 +39,8 @@ def paint_share(picture: Image, camera: Camera, pitch: PitchTemplate) -> float |
     ridges = []
     for side in (-3.0, 0.0, 3.0):
         offset = steps + side * width
-        edges = np.maximum(look(offset - 1.5 * width), look(offset + 1.5 * width))
-        ridges.append((look(offset) - edges).max(axis=1))
-    return float((ridges[1] > np.maximum(np.maximum(ridges[0], ridges[2]), 2.0)).mean())
+        middle, *edges = look(offset), look(offset - 1.5 * width), look(offset + 1.5 * width)
+        over = [sign * middle - np.maximum(*(sign * np.array(edges))) for sign in (1.0, -1.0)]
+        ridges.append(np.max(over, axis=-1))
+    near, here, far = np.array(ridges)  # each (2, places)
+    return float((here > np.maximum(np.maximum(near, far), 2.0)).mean(axis=1).max())

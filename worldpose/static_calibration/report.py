@@ -182,6 +182,14 @@ def build_report(
         decisions.append(f"painted lines: {lines.reason or samples}")
         if not lines.refined:
             reasons.append(f"no painted lines to confirm it: {lines.reason}")
+        # Real pitches have up to 0.027 m, and 0.055 m with a length and width 1 m off.
+        uneven = 0.0 if lines.noise is None else lines.noise.unevenness_m
+        if uneven > 0.02 and pitch.assumed & {"length", "width"}:
+            (reasons if uneven > 0.03 else decisions).append(
+                f"the painted lines lie {100.0 * uneven:.1f} cm off their places "
+                f"on a pitch of {pitch.length:g} x {pitch.width:g} m, a size that nobody measured: "
+                "measure length and width (pitch.json)"
+            )
     deviations = _lens_deviations(problem.lens, estimate.camera, problem.half_diagonal)
     if deviations:
         most = max(deviations, key=lambda name: deviations[name])

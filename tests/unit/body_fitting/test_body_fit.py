@@ -13,7 +13,7 @@ from worldpose.body.jacobian import ChainedKeypoints
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BodyParameters
 from worldpose.body_fitting import estimate
-from worldpose.body_fitting.bones import Shape, pool_shapes
+from worldpose.body_fitting.bones import Shape, agree, pool_shapes
 from worldpose.body_fitting.estimate import fit_bodies
 from worldpose.body_fitting.evidence import (
     JOINT_SPREAD,
@@ -151,6 +151,12 @@ def test_arrays_that_do_not_fit_are_refused():
         fit_bodies(
             MODEL, ClipEvidence(np.zeros((3, 1, 14, 3)), np.zeros((3, 1, 14, 3, 3)), 50.0), SETTINGS
         )
+    joints, bias = np.zeros((1, 1, 17, 3)), np.full(17, 0.03)
+    alone = 0.01**2 * np.broadcast_to(np.eye(3), (1, 1, 17, 3, 3))
+    whole = alone + np.float32(0.03**2 - 0.01**2) * np.eye(3)  # nothing else, rounded
+    ClipEvidence(joints, (whole - alone).astype(np.float32), 50.0, bias)
+    with pytest.raises(InputError, match=r"common_bias.*covariance of 17 joints"):
+        ClipEvidence(joints, alone, 50.0, bias)
 
 
 def test_offsets_are_far_beyond_the_chance_of_all_joints_together():
@@ -256,6 +262,10 @@ def test_a_person_of_several_clips_is_what_they_say_together_with_anybody_counte
     # Two correlated_frames of precision 4 and the prior's 1: (4 x 1 + 4 x 2) / 9.
     np.testing.assert_allclose(pooled.betas, [12.0 / 9.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(pooled.covariance, np.diag([1.0 / 9.0, 1.0]), atol=1e-12)
+    # One in a thousand pairs of clips of one person is farther apart, 13.8 of two betas.
+    limit = np.sqrt(13.8 * 0.4)
+    for apart, said in ((limit, True), (limit + 0.01, False)):
+        assert agree(clips[0], Shape(clips[0].betas + [apart, 0.0], covariance)) == said
 
 
 CAMERA = broadcast(1)

@@ -47,6 +47,11 @@ LAYOUTS = {
         **CROP,
     },
     "SMPL in one": {"poses": VECTORS.reshape(3, 72), **CROP},
+    "VIBE": {
+        "pose": VECTORS.reshape(3, 72),
+        "bboxes": np.append(CROP["box_center"], [[6.0, 9.0]] * 3, axis=1),
+        "frame_ids": np.array([4, 4, 7]),
+    },
 }
 
 
@@ -58,7 +63,8 @@ def written(tmp_path, arrays):
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_turns_and_crops_are_the_same_whatever_the_method(tmp_path, layout):
-    found = read_monocular(written(tmp_path, LAYOUTS[layout] | {"frame": np.array([4, 4, 7])}))
+    frame = {} if "frame_ids" in LAYOUTS[layout] else {"frame": np.array([4.0, 4.0, 7.0])}
+    found = read_monocular(written(tmp_path, LAYOUTS[layout] | frame))
     np.testing.assert_allclose(found.rotations, MATRICES, atol=1e-12)
     np.testing.assert_array_equal(found.center, CROP["box_center"])
     np.testing.assert_array_equal(found.frame, [4, 4, 7])
@@ -73,6 +79,10 @@ def test_turns_and_crops_are_the_same_whatever_the_method(tmp_path, layout):
         ({"body_pose": np.zeros((3, 21, 3))}, "23 joints"),
         ({"global_orient": np.zeros((2, 3))}, "2 and 3"),
         ({"frame": np.zeros(5)}, "3 frames"),
+        ({"frame": np.array([1.0, 2.5, 3.0])}, "whole frame"),
+        ({"frame": np.array([1.0, np.nan, 3.0])}, "whole frame"),
+        ({"box_center": None, "bbox": np.tile([900.0, 500.0, 1.5], (3, 1))}, "corners"),
+        ({"box_center": None, "bbox": np.tile([900.0, 500.0, 120.0, 300.0], (3, 1))}, "corners"),
     ],
 )
 def test_files_that_lack_something_are_refused_with_its_name(tmp_path, change, says):
@@ -81,6 +91,12 @@ def test_files_that_lack_something_are_refused_with_its_name(tmp_path, change, s
     with pytest.raises(InputError, match=says) as told:
         read_monocular(path)
     assert str(path) in str(told.value)
+
+
+def test_boxes_with_scores_at_the_border_or_of_nobody_are_read():
+    boxes = np.array([[0.0, 0.0, 20.0, 40.0, 0.9], [0.0, 8.0, 0.0, 10.0, 0.5], [np.nan] * 5])
+    found = parse_monocular({"poses": VECTORS.reshape(3, 72), "bbox": boxes}, "a.npz")
+    np.testing.assert_array_equal(found.center, [[10.0, 20.0], [0.0, 9.0], [np.nan, np.nan]])
 
 
 EXACT = MonocularErrors(turn=0.0, facing=0.0, size=0.0, place=0.0, missed=0.0)

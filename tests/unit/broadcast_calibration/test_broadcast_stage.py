@@ -5,6 +5,7 @@ import shutil
 import numpy as np
 import pytest
 import turning_clip as clip
+from run_records import match_spec
 
 from data_contracts.body_fitting import BODY_FITTING
 from data_contracts.broadcast_calibration import FRAME_STATUS, KeyFrame, KeyFrames
@@ -67,34 +68,15 @@ def folder(tmp_path_factory):
     both = true.camera.project(joints(60 + (numbers - OFFSET) / 1.2).reshape(VIDEO, -1, 3))
     both = both.reshape(VIDEO, 12, 17, 2) + rng.standard_normal((VIDEO, 12, 17, 2))
     static: Camera = true.camera[0]
-    width, height = clip.SIZE
-    spec = MatchSpec(
-        match_id="stage",
-        fps=FPS,
-        cameras=(
-            CameraSpec(id="one", width=width, height=height),
-            CameraSpec(id="main", kind="broadcast", width=width, height=height),
-            CameraSpec(id="wide", kind="broadcast", width=width, height=height),
-            CameraSpec(id="fast", kind="broadcast", width=width, height=height, fps=1.2 * FPS),
-        ),
-        clips=(
-            ClipSpec(
-                id="goal",
-                first_frame=FIRST,
-                frame_count=COUNT,
-                broadcast="main",
-                broadcast_offset_frames=OFFSET,
-            ),
-            ClipSpec(id="shot", first_frame=90, frame_count=COUNT, broadcast="main"),
-            ClipSpec(
-                id="both",
-                first_frame=60,
-                frame_count=COUNT,
-                broadcast=("wide", "fast"),
-                broadcast_offset_frames={"wide": 0.0, "fast": OFFSET},
-                broadcast_smooth_weight=2.0,
-            ),
-        ),
+    tv = {"kind": "broadcast"}
+    goal = {"broadcast": "main", "broadcast_offset_frames": OFFSET, "first_frame": FIRST}
+    two = {"broadcast": ("wide", "fast"), "broadcast_smooth_weight": 2.0, "first_frame": 60}
+    two["broadcast_offset_frames"] = {"wide": 0.0, "fast": OFFSET}
+    clips = {"goal": goal, "shot": {"broadcast": "main", "first_frame": 90}, "both": two}
+    spec = match_spec(
+        {"one": {}, "main": tv, "wide": tv, "fast": {**tv, "fps": 1.2 * FPS}},
+        {name: {**own, "frame_count": COUNT} for name, own in clips.items()},
+        **{"size": clip.SIZE, "match_id": "stage", "fps": FPS},
     )
     key = KeyFrame(frame=9, markings=clicks(true, 9))
     other = KeyFrame(frame=2, markings=clicks(true, 2))

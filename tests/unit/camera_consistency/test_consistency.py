@@ -135,6 +135,24 @@ def test_cameras_of_another_match_are_strangers_without_a_diagnosis():
     assert (result.faults, result.strangers) == ((), (0, 1, 2, 3, 4))
 
 
+@pytest.mark.parametrize("still", [False, True])
+def test_low_cameras_and_people_who_stand_show_no_strangers(still):
+    rng, world = np.random.default_rng(0), walkers(22, 0)
+    places = rng.uniform([-50, -32], [50, 32], (22, 2))
+    world[..., :2] += (places - world[0, :, :, :2].mean(axis=1))[None, :, None]
+    world = world[:1].repeat(FRAMES, axis=0) if still else world
+    stands = [(0, -45, 2.5), (50, -40, 2.5), (-60, 0, 2.5)]
+    cameras = [looking(place, (0.0, 0.0, 1.0), distortion=(0.0,) * 5) for place in stands]
+    # Detectors place joints with habits of 2 cm, different in each view.
+    views = [
+        seen([each], world + rng.normal(0, 0.02, (17, 3)), n) for n, each in enumerate(cameras)
+    ]
+    keypoints = np.concatenate(views, axis=1)
+    result = check(cameras, keypoints + rng.normal(0, 1.7, keypoints.shape))
+    assert (result.faults, result.strangers) == ((), ())
+    assert result.unconfirmed == (0, 1, 2)
+
+
 @pytest.mark.parametrize("change", ["axes", "unit"])
 def test_a_wrong_world_is_no_fault_of_its_cameras(change):
     cameras = rig()

@@ -7,7 +7,6 @@ import pytest
 from faulty_data_sets import FPS, FRAMES, PERSONS, looking
 
 from data_contracts.conventions import COCO17
-from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BodyParameters
 from worldpose.formats.challenge import challenge_truth, write_challenge, write_submission
@@ -18,11 +17,6 @@ from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 
 LENS = (0.05, 0.02, 0.004, -0.003, 0.03)
-
-
-@pytest.fixture(scope="session")
-def model():
-    return load_open_body()
 
 
 @pytest.fixture(scope="session")

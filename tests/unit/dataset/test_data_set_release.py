@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 import xarray as xr
 from faulty_data_sets import FPS, PERSONS, edit, transpose_rotation
-from run_records import StubRun
+from run_records import StubRun, match_spec
 
 from data_contracts.conventions import COCO17
-from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from flows.results.best_results import Origin
 from flows.results.data_set_release import ASSETS, check_data_set, write_data_set
 from worldpose.body.body_file import save_body
@@ -76,18 +75,10 @@ def origins(model, poses, main_camera, tmp_path_factory):
         folder = tmp_path_factory.mktemp("matches") / match
         (folder / "broadcast").mkdir(parents=True)
         (folder / "detections").mkdir()
-        spec = MatchSpec(
-            match_id=match,
-            fps=FPS,
-            cameras=(
-                CameraSpec(id="north", width=1920, height=1080),
-                CameraSpec(id="main", kind="broadcast", width=1920, height=1080),
-            ),
-            clips=tuple(
-                ClipSpec(id=name, first_frame=first, frame_count=HALF, broadcast="main")
-                for name, first in (("A", 0), ("B", HALF))
-            ),
-        )
+        filmed = {"frame_count": HALF, "broadcast": "main"}
+        clips = {name: {"first_frame": n, **filmed} for name, n in (("A", 0), ("B", HALF))}
+        cameras = {"north": {}, "main": {"kind": "broadcast"}}
+        spec = match_spec(cameras, clips, match_id=match, fps=FPS)
         (folder / "match.yaml").write_text(spec.model_dump_json(exclude_none=True))
         for name in ("north", "A", "B"):
             (folder / "detections" / f"{name}.json").write_text("[]")
@@ -369,14 +360,8 @@ def test_a_planted_fault_is_found(written, tmp_path, name):
     [
         ({"hidden": None}, "--hidden: expected a folder for the test part"),
         ({"licences": {"poses": "x"}}, "set: joints: expected no contradiction, found no licence"),
-        (
-            {"footage": "copy", "licences": dict.fromkeys(ASSETS[:-1], "x")},
-            "footage: expected no contradiction, found no licence",
-        ),
-        (
-            {"subjects": "keeper: [ann-1/A/0, bea-1/A/0]"},
-            "keeper: expected no contradiction, found the subject is in train and val",
-        ),
+        ({"footage": "copy", "licences": dict.fromkeys(ASSETS[:-1], "x")}, "footage: expected no"),
+        ({"subjects": "keeper: [ann-1/A/0, bea-1/A/0]"}, "keeper: expected no contradiction"),
         ({"subjects": "keeper: [ann-1/A/77]"}, "keeper: expected a list of MATCH/NAME"),
         ({"subjects": "[keeper]"}, "expected a list of MATCH/NAME"),
         ({"name": "my set"}, "expected 1 to 64 letters, .* found 'release-my set'"),

@@ -339,12 +339,7 @@ def late(arrays):
     [
         ("mine", "poses", shorter, "poses/A_1.npz: transl: expected frames 0 to 39 of the clip"),
         ("mine", "cameras", transpose_rotation, "cameras/A_1.npz: R: expected x_cam = R x_world"),
-        (
-            "mine",
-            "poses",
-            without_model,
-            "poses/A_1.npz: body_model: expected the name of the body",
-        ),
+        ("mine", "poses", without_model, "poses/A_1.npz: body_model: expected the name of the"),
         ("true", "cameras", transpose_rotation, "cameras/A_1.npz: R: expected x_cam = R x_world"),
         ("true", "cameras", lambda a: a.update({n: a[n][1:] for n in "KkRt"}), "npz: K: expected"),
     ],

@@ -232,15 +232,8 @@ def test_looks_at_every_third_frame_give_boxes_in_all_of_them():
             np.testing.assert_allclose(one.boxes, [walker(number)], atol=1e-9)
 
 
-def boxed_people(*rows):
-    rows = np.array(rows, dtype=np.float64).reshape(-1, 5)
-    return People(rows[:, :4], rows[:, 4])
-
-
 def test_the_best_of_two_boxes_of_a_person_stays():
-    found = suppress(
-        boxed_people([0, 0, 10, 20, 0.5], [1, 0, 11, 20, 0.9], [50, 0, 60, 20, 0.2]), 0.6
-    )
+    found = suppress(people([0, 0, 10, 20, 0.5], [1, 0, 11, 20, 0.9], [50, 0, 60, 20, 0.2]), 0.6)
     assert found.scores.tolist() == [0.9, 0.2]
 
 
@@ -250,8 +243,6 @@ class Blobs:
     view_size = (64, 48)
 
     def detect(self, pictures):
-        import cv2
-
         found = []
         for picture in pictures:
             assert picture.shape == (48, 64, 3)
@@ -259,9 +250,7 @@ class Blobs:
                 (picture[..., 0] > 200).astype(np.uint8)
             )
             found.append(
-                boxed_people(
-                    *[(x, y, x + w - 1, y + h - 1, 0.9) for x, y, w, h, _ in stats[1:] if w > 2]
-                )
+                people(*[(x, y, x + w - 1, y + h - 1, 0.9) for x, y, w, h, _ in stats[1:] if w > 2])
             )
         return found
 

@@ -118,6 +118,9 @@ def test_rows_of_trc_are_at_their_frames_and_zeros_are_missing(tmp_path, numbers
     (tmp_path / "a.trc").write_text("\n".join([*text[:6], text[7], text[6].replace("0.0", "")]))
     with pytest.raises(InputError, match="that rise"):
         read_markers(tmp_path / "a.trc")
+    (tmp_path / "a.trc").write_text("\n".join(text[:6]) + "\n")
+    with pytest.raises(InputError, match="samples of markers, found none"):
+        read_markers(tmp_path / "a.trc")
 
 
 def test_joints_are_means_of_markers_as_the_map_says(tmp_path):
@@ -225,6 +228,15 @@ def test_places_of_every_form_and_way_name_the_people(tmp_path, form, way):
     scores, _ = evaluate_joints(predicted, given, fps=25.0)
     assert scores.mpjpe_mm == pytest.approx(100.0)
     assert (scores.coverage, scores.switches, scores.persons) == (1.0, 0, 3)
+
+
+def test_people_of_one_name_are_told_apart_and_pieces_of_a_track_are_not(tmp_path):
+    people = [(0, 7, "Ann"), (0, 9, "Ann"), (0, 4, "Eve"), (1, 7, "Ann"), (1, 12, "Eve")]
+    lines = [f"{frame},{who},{name},{who},2" for frame, who, name in people]
+    (tmp_path / "a.csv").write_text("\n".join(["frame_id,player_id,name,x,y", *lines]))
+    _, names, places, _ = read_positions(tmp_path / "a.csv")
+    assert names == ("Ann 7", "Ann 9", "Eve")
+    np.testing.assert_array_equal(places[..., 0], [[7.0, 9.0, 4.0], [7.0, np.nan, 12.0]])
 
 
 @pytest.mark.parametrize("timed", [True, False])

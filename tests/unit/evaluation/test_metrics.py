@@ -7,6 +7,7 @@ import pytest
 from joint_regions import region_counts
 from people_samples import crowd, person, score, tracks
 
+from worldpose.errors import InputError
 from worldpose.evaluation.matching import identity_scores
 from worldpose.evaluation.metrics import evaluate_joints
 from worldpose.formats.joints_file import JointTracks
@@ -106,6 +107,13 @@ def test_frames_are_paired_by_number():
     assert (beyond.frames, beyond.coverage, beyond.false_persons_per_frame) == (4, 1.0, 0.0)
 
 
+def test_frames_that_never_meet_are_refused():
+    truth = crowd()
+    later = JointTracks(truth.frames + 1000, truth.person_ids, truth.joints)
+    with pytest.raises(InputError, match="which has some of 0 to 3, found 1000 to 1003, none in"):
+        score(later, truth)
+
+
 def test_an_empty_prediction_and_an_empty_truth_have_no_error():
     truth = crowd()
     nobody = JointTracks(truth.frames, np.arange(0), np.empty((4, 0, 17, 3)))
@@ -114,6 +122,7 @@ def test_an_empty_prediction_and_an_empty_truth_have_no_error():
     assert score(truth, nobody).coverage is None
     assert score(truth, nobody).false_persons_per_frame == 3.0
     no_frames = JointTracks(np.arange(0), np.arange(0), np.empty((0, 0, 17, 3)))
+    assert score(no_frames, truth).coverage == 0.0
     assert score(truth, no_frames).model_dump(exclude_none=True) == {"persons": 0, "frames": 0}
 
 

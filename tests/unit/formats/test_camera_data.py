@@ -4,8 +4,8 @@ import struct
 
 import numpy as np
 import pytest
+from run_records import calibration
 
-from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError
 from worldpose.formats.archives import write_archive
 from worldpose.formats.camera_data import (
@@ -235,14 +235,10 @@ def test_what_is_written_is_read_again_and_a_lens_table_gives_focal_lengths(tmp_
         apply_zoom_table(data, lens, SIZE)
 
 
-CALIBRATION = CameraCalibration(
-    id="north",
-    image_size=(1920, 1080),
-    focal_px=(2000.0, 2010.0),
-    principal_point_px=(955.0, 541.0),
-    distortion=(-0.1, 0.02, 0.001, -0.002, 0.003),
-    rotation=((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
-    translation=(1.0, 5.0, 60.0),
+CALIBRATION = calibration(
+    "north",
+    **{"focal_px": (2000.0, 2010.0), "principal_point_px": (955.0, 541.0)},
+    **{"distortion": (-0.1, 0.02, 0.001, -0.002, 0.003), "translation": (1.0, 5.0, 60.0)},
 )
 
 

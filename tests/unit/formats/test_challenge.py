@@ -8,7 +8,6 @@ import pandas as pd
 import pytest
 from camera_builders import plain_camera
 
-from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import BODY25, fold_keypoints
 from worldpose.body.model import BodyParameters
 from worldpose.errors import InputError
@@ -28,11 +27,6 @@ from worldpose.geometry.rigid import Rigid
 
 FRAMES = 3
 K1 = 0.2
-
-
-@pytest.fixture(scope="module")
-def model():
-    return load_open_body()
 
 
 @pytest.fixture(scope="module")

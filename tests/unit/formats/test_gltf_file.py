@@ -13,7 +13,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from viewer_clips import CENTER, bodies_clip, mixed_clip
 
-from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import SKELETONS
 from worldpose.body.model import BodyParameters
 from worldpose.errors import InputError
@@ -40,11 +39,6 @@ IN_NODE = pytest.mark.skipif(
     reason="no gltf-validator and three: npm ci in infra/review_pages",
 )
 NOTES = {"software": "worldpose", "licence": "For tests alone.", "clip": "a"}
-
-
-@pytest.fixture(scope="module")
-def model():
-    return load_open_body()
 
 
 def motion(seed, frames=FRAMES):

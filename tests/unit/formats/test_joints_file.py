@@ -97,15 +97,9 @@ def test_numbers_that_a_file_would_cut_are_refused(changes):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (
-            {"joints": None},
-            "expected the members frames, person_ids, joints .*found frames, person",
-        ),
+        ({"joints": None}, "expected the members frames, person_ids, joints .*found frames"),
         ({"joint": np.zeros(3)}, "expected the members"),
-        (
-            {"joints": np.zeros((3, 2, 15, 3))},
-            r"joints: expected shape \(3, 2, 17, 3\), found \(3, 2",
-        ),
+        ({"joints": np.zeros((3, 2, 15, 3))}, r"joints: expected shape \(3, 2, 17, 3\), found"),
         ({"joints": np.zeros((3, 2, 17, 3), dtype=int)}, "expected float numbers, found <i8"),
         ({"frames": np.arange(3.0)}, "frames: expected int numbers"),
         ({"frames": np.array([0, 2, 1])}, "frames: expected frame numbers that rise"),

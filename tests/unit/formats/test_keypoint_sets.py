@@ -266,6 +266,18 @@ def test_the_frame_is_the_number_that_differs_from_name_to_name(names, wanted):
     assert list(map(frame_numbers(names).get, names))[: len(wanted)] == wanted
 
 
+def test_files_of_several_clips_are_refused(tmp_path):
+    names = ["take1_10", "take1_11", "take2_5"]
+    (tmp_path / "a_json").mkdir()
+    for name in names:
+        (tmp_path / "a_json" / f"{name}.json").write_text('{"people": []}')
+    people = [{"image_id": f"{name}.jpg", "keypoints": points(COCO17)} for name in names]
+    (tmp_path / "b.json").write_text(json.dumps(people))
+    for read, file in ((read_openpose_folder, "a_json"), (read_coco_results, "b.json")):
+        with pytest.raises(InputError, match=r"rises by image .*several clips or times"):
+            read(tmp_path / file)
+
+
 def test_pictures_of_one_number_are_refused_and_frame_id_helps_out(tmp_path):
     images = [{"id": n, "file_name": f"{n}ab.jpg", "frame_id": n + 4} for n in (3, 5)]
     found = read_coco_results(data_set(tmp_path / "a.json", images))

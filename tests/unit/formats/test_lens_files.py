@@ -5,8 +5,9 @@ import json
 import cv2
 import numpy as np
 import pytest
+from run_records import calibration
 
-from data_contracts.cameras import COEFFICIENTS, CameraCalibration
+from data_contracts.cameras import COEFFICIENTS
 from worldpose.errors import InputError
 from worldpose.formats.calibration_forms import read_calibration
 from worldpose.formats.calibration_writer import write_calibration_toml
@@ -228,32 +229,17 @@ def test_a_file_with_a_matrix_of_its_own_has_one_lens(name, content, tmp_path):
     ("content", "said"),
     [
         ({"cameras": [{"name": "left", **ENTRY}] * 2}, "name of its own, found 'left' a second"),
-        (
-            {"cameras": [{"name": "left", **ENTRY}, ENTRY]},
-            r"cameras\[1\]: expected a lens with a name",
-        ),
+        ({"cameras": [{"name": "left", **ENTRY}, ENTRY]}, r"cameras\[1\]: expected a lens with a"),
         ({"cameras": {"left": ENTRY, "right": 3}}, r"cameras\[1\]: .* found 3"),
-        (
-            {**LENS, "cameraMatrix": np.eye(3).tolist()},
-            "cameraMatrix: expected the value of camera_matrix",
-        ),
-        (
-            {"camera_matrix": {"rows": 3, "cols": 3, "data": [[1], [1, 2]]}},
-            r"data \[\[1\], \[1, 2\]\]",
-        ),
-        (
-            {"camera_matrix": {"rows": "x", "cols": 3, "data": [1]}},
-            "rows x cols numbers, found rows 'x'",
-        ),
+        ({**LENS, "cameraMatrix": np.eye(3).tolist()}, "cameraMatrix: expected the value of"),
+        ({"camera_matrix": {"rows": 3, "cols": 3, "data": [[1], [1, 2]]}}, r"data \[\[1\], \[1"),
+        ({"camera_matrix": {"rows": "x", "cols": 3, "data": [1]}}, "rows x cols numbers, found"),
         ({"camera_matrix": {"rows": 10**30, "cols": 3, "data": [1]}}, "rows x cols numbers"),
         ({"camera_matrix": {"rows": 3, "cols": 3, "data": None}}, "data nothing"),
         ({"dist": [0.0] * 5}, "camera_matrix, mtx or K .capitals and underscores"),
         ({**LENS, "lensmodel": "LENSMODEL_OPENCV8"}, "found 'lensmodel_opencv8'"),
         ({**LENS, "camera_model": "omni"}, "camera_model: expected one of .* found 'omni'"),
-        (
-            {**LENS, "model": "fisheye", "fisheye": False},
-            "one lens model, found model fisheye, fisheye fal",
-        ),
+        ({**LENS, "model": "fisheye", "fisheye": False}, "one lens model, found model fisheye"),
         ({"cameras": {"left": {**ENTRY, "model": "omni"}}}, "model: expected one of .* 'omni'"),
         ({"cameras": {"cam0": ENTRY, "cam1": ENTRY}}, "camera left, found cam0, cam1.*to left"),
     ],
@@ -355,16 +341,10 @@ ROS = {"fisheye": "equidistant", "rational": "rational_polynomial"}
 
 def camera_of(model, **changes):
     values = {
-        "id": "a",
-        "image_size": (640, 480),
-        "focal_px": (400.0, 402.0),
-        "principal_point_px": (319.5, 239.5),
-        "distortion": LENSES[model],
-        "lens_model": model,
-        "rotation": ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
-        "translation": (0.1, 1.2, 4.0),
+        **{"image_size": (640, 480), "focal_px": (400.0, 402.0), "distortion": LENSES[model]},
+        **{"principal_point_px": (319.5, 239.5), "translation": (0.1, 1.2, 4.0)},
     }
-    return CameraCalibration(**{**values, **changes})
+    return calibration("a", **{"lens_model": model, **values, **changes})
 
 
 def opencv(one, points):

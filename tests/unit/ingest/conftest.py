@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
+from run_records import calibration, match_spec
 
-from data_contracts.cameras import CameraCalibration
 from data_contracts.keypoints import KeypointDetections
-from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from worldpose.ingest.writing import write_match
 
 CAMERA_ANGLES = {"cam1": 0.5, "cam2": -0.3}
@@ -36,12 +35,13 @@ def make_people():
 def make_camera():
     def camera(name="cam1", angle=0.5, size=(1920, 1080)):
         c, s = float(np.cos(angle)), float(np.sin(angle))
-        return CameraCalibration(
-            id=name,
-            image_size=size,
-            focal_px=(1000.1, 1001.2),
-            principal_point_px=(960.3, 540.7),
-            distortion=(-0.1, 0.02, 1e-4, -2e-4, 0.003),
+        return calibration(
+            name,
+            **{"image_size": size, "focal_px": (1000.1, 1001.2)},
+            **{
+                "principal_point_px": (960.3, 540.7),
+                "distortion": (-0.1, 0.02, 1e-4, -2e-4, 0.003),
+            },
             rotation=((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)),
             translation=(0.1, -0.2, 30.123456789012345),
         )
@@ -51,18 +51,12 @@ def make_camera():
 
 @pytest.fixture
 def spec():
-    return MatchSpec(
-        match_id="tiny",
-        fps=50.0,
-        cameras=(
-            CameraSpec(id="cam1", width=1920, height=1080),
-            CameraSpec(id="cam2", width=1920, height=1080, offset_frames=10),
-            CameraSpec(id="main", kind="broadcast", width=1280, height=720),
-        ),
-        clips=(
-            ClipSpec(id="goal", first_frame=5, frame_count=3, broadcast="main"),
-            ClipSpec(id="corner", first_frame=9, frame_count=2),
-        ),
+    main = {"kind": "broadcast", "width": 1280, "height": 720}
+    goal = {"first_frame": 5, "frame_count": 3, "broadcast": "main"}
+    return match_spec(
+        {"cam1": {}, "cam2": {"offset_frames": 10}, "main": main},
+        {"goal": goal, "corner": {"first_frame": 9, "frame_count": 2}},
+        **{"match_id": "tiny", "fps": 50.0},
     )
 
 

@@ -10,9 +10,10 @@ import pytest
 import yaml
 from PIL import Image
 from pydantic import ValidationError
+from run_records import match_spec
 
 from data_contracts.broadcast_calibration import KeyFrame, KeyFrames
-from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
+from data_contracts.match import MatchSpec
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
 from worldpose.errors import InputError
 from worldpose.ingest.clock import ImageClock, rows_at
@@ -20,15 +21,12 @@ from worldpose.ingest.footage import footage_size, image_clock, read_still, unit
 from worldpose.ingest.match_folder import read_match, require_calibrated
 from worldpose.ingest.writing import MatchAnnotations
 
-SIZE = {"width": 1920, "height": 1080}
-
 
 def match(broadcast, offsets=0.0, **fast):
-    cameras = [CameraSpec(id="one", **SIZE)]
-    cameras += [CameraSpec(id=name, kind="broadcast", **(SIZE | fast)) for name in ("main", "fast")]
-    clip = {"id": "goal", "first_frame": 100, "frame_count": 6}
+    tv = {"kind": "broadcast", **fast}
+    clip = {"first_frame": 100, "frame_count": 6}
     clip |= {"broadcast": broadcast, "broadcast_offset_frames": offsets}
-    return MatchSpec(match_id="m", fps=50.0, cameras=tuple(cameras), clips=(ClipSpec(**clip),))
+    return match_spec({"one": {}, "main": tv, "fast": tv}, {"goal": clip}, fps=50.0)
 
 
 @pytest.mark.parametrize(

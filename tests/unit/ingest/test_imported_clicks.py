@@ -2,12 +2,14 @@
 
 import json
 import os
+import shutil
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import pytest
 
+from data_contracts.pitch import PitchSpec
 from flows.review.repeated_clicks import explain_repeated
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.annotations.marked_images import read_marked_images
@@ -273,8 +275,42 @@ def test_labels_are_places_from_a_corner_or_the_centre_on_either_side(tmp_path, 
         *("at_5.50_34.00", "at_-30.50_-34.00"),
     }
     pitch = json.loads((folder / "pitch.json").read_text())
-    assert pitch["points"]["at_5.50_34.00"] == [5.5, 34.0, -0.2]  # the crown falls to the line
+    assert pitch["points"]["at_5.50_34.00"] == [5.5, 34.0]  # nobody measured its height
     assert read_pitch(folder, read_spec(folder)).points.keys() == report.own_points.keys()
+
+
+QUADRANT = [(52.5, 34.0), (52.5, 20.16), (36.0, 20.16), (41.5, 0.0), (50.0, 30.0)]
+"""Places from the centre spot in one quadrant, all but the last one on markings."""
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (52.5, 34.0)])
+def test_places_of_one_quadrant_are_from_where_they_are_points_of_the_pitch(tmp_path, shift):
+    labels = ["({:g},{:g})".format(*np.add(place, shift)) for place in QUADRANT]
+    pixels = map(tuple, seen(QUADRANT))
+    folder = match(tmp_path / "m")
+    report = import_clicks(cvat(tmp_path / "c.xml", zip(labels, pixels, strict=True)), folder)
+    assert report.own_points == {"at_50.00_30.00": (50.0, 30.0)}
+    said = ["places are from the centre spot: 4 of 5 are points of the pitch then, and 1 if they"]
+    assert [note[: len(said[0])] for note in report.notes] == ([] if any(shift) else said)
+
+
+def test_places_depend_on_the_pitch_of_the_venue_and_names_do_not(tmp_path):
+    folder = match(tmp_path / "m")
+    with (folder / "match.yaml").open("a") as file:
+        file.write("venue: parken\n")
+    size = PitchSpec(length=101.0, width=66.0)
+    labels = [f"({x + 50.5:g},{y + 33.0:g})" for x, y in QUADRANT]
+    pixels = [*map(tuple, seen(QUADRANT))]
+    twice = [*CLICKS.items(), ("halfway_far", (960.0, 301.0))]
+    for clicks in ([*zip(labels, pixels, strict=True)], twice):
+        with pytest.raises(InputError, match="the pitch of venue 'parken'"):
+            import_clicks(cvat(tmp_path / "c.xml", clicks), folder)
+    assert [file.name for file in folder.iterdir()] == ["match.yaml"]
+    import_clicks(cvat(tmp_path / "c.xml", CLICKS.items()), folder)
+    shutil.rmtree(folder / "annotations")
+    import_clicks(cvat(tmp_path / "c.xml", twice), folder, pitch=size)
+    own = {"halfway_far.again": (0.0, 33.0)}
+    assert read_pitch(folder, read_spec(folder)) == size.model_copy(update={"points": own})
 
 
 @pytest.mark.parametrize(
@@ -352,10 +388,7 @@ LEFT_OUT = {
     [
         ("cvat.xml", "lines: 1 box of b, 1 ellipse of center_circle, 1 polygon of adboard"),
         ("studio.json", "lines: 1 brushlabels of halfway_line"),
-        (
-            "coco.json",
-            "lines: 1 annotation of an image not listed, 1 annotation without keypoints of half",
-        ),
+        ("coco.json", "lines: 1 annotation of an image not listed, 1 annotation without"),
     ],
 )
 def test_shapes_that_are_not_read_are_counted(tmp_path, name, said):

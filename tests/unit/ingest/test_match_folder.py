@@ -6,8 +6,9 @@ import math
 import numpy as np
 import pytest
 import yaml
+from run_records import match_spec
 
-from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
+from data_contracts.match import MatchSpec
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
 from worldpose.formats.keypoint_files import read_observations
@@ -230,12 +231,7 @@ def test_a_unit_without_detections_is_refused(match_folder, unit_id):
 
 @pytest.fixture
 def one():
-    return MatchSpec(
-        match_id="one",
-        fps=25.0,
-        cameras=(CameraSpec(id="cam1", width=1920, height=1080),),
-        clips=(ClipSpec(id="clip", frame_count=3),),
-    )
+    return match_spec(["cam1"], {"clip": {"frame_count": 3}})
 
 
 def files(folder):

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from calibration_writers import write_easymocap
 from pydantic import ValidationError
+from run_records import match_spec
 
-from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
+from data_contracts.match import CameraSpec
 from worldpose.errors import InputError
 from worldpose.formats.calibration_forms import read_calibration
 from worldpose.formats.calibration_writer import write_calibration_toml
@@ -242,12 +243,7 @@ def test_easymocap_takes_the_size_of_the_videos_and_leaves_out_what_has_no_pose(
     assert notes == ["camera three is left out: it has no pose"]
 
 
-SPEC = MatchSpec(
-    match_id="m",
-    fps=25,
-    cameras=(CameraSpec(id="cam", width=1920, height=1080),),
-    clips=(ClipSpec(id="clip", frame_count=1),),
-)
+SPEC = match_spec(["cam"])
 
 
 def read(folder, content):

@@ -7,8 +7,8 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+from run_records import calibration
 
-from data_contracts.cameras import CameraCalibration
 from data_contracts.conventions import COCO17
 from worldpose.body.keypoints import BODY25
 from worldpose.errors import InputError
@@ -24,15 +24,8 @@ CAMERAS = ("cam01", "cam02")
 
 
 def camera(name, x=0.0):
-    return CameraCalibration(
-        id=name,
-        image_size=(1088, 1920),
-        focal_px=(1500.0, 1500.0),
-        principal_point_px=(540.0, 960.0),
-        distortion=(0.0,) * 5,
-        rotation=((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
-        translation=(x, 1.0, 5.0),
-    )
+    lens = {"image_size": (1088, 1920), "principal_point_px": (540.0, 960.0)}
+    return calibration(name, translation=(x, 1.0, 5.0), **lens)
 
 
 def person(size, seed):

@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from run_records import match_spec
 
-from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.pitch import TEMPLATES, ArcSpec, LineSpec, PitchSpec
 from worldpose.errors import InputError
 from worldpose.ingest.pitch_file import read_pitch
@@ -70,6 +70,9 @@ def test_penalty_arcs_begin_and_end_on_the_line_of_the_area(standard):
         assert np.abs(arc[:, 0]).min() == pytest.approx(52.5 - 20.15, abs=0.01)
 
 
+SIDES_OF_Y, BOTH = ("near", "far"), {"length", "width"}
+
+
 def test_surveyed_points_replace_nominal_ones_and_carry_their_markings():
     spec = PitchSpec(
         points={"corner_left_near": (-52.4, -33.9, -0.15), "penalty_mark_left": (-41.4, 0.1, 0.02)}
@@ -91,6 +94,26 @@ def test_surveyed_points_replace_nominal_ones_and_carry_their_markings():
     # The mark lies 0.02 m above the axis, and so does the whole arc above the crown.
     above = arc[:, 2] - template.height(arc[:, 0], arc[:, 1])
     np.testing.assert_allclose(above, 0.02 + 0.2 * (0.1 / 34.0) ** 2, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("points", "known"),
+    [
+        ({"mast": (-58.0, 12.0, 0.4)}, set()),
+        (
+            {f"penalty_area_left_{y}_{x}": None for y in SIDES_OF_Y for x in ("back", "front")},
+            set(),
+        ),
+        ({f"corner_{x}_{y}": None for x in ("left", "right") for y in SIDES_OF_Y}, BOTH),
+        (dict.fromkeys(PitchTemplate.standard().points), BOTH | {"crown", "end_fall"}),
+    ],
+    ids=["mast", "one area", "corners", "all"],
+)
+def test_surveyed_points_say_the_dimensions_that_they_determine(points, known):
+    standard = PitchTemplate.standard()
+    places = {name: at or tuple(standard.points[name]) for name, at in points.items()}
+    found = PitchTemplate.from_spec(PitchSpec(points=places))
+    assert found.assumed == standard.assumed - known
 
 
 def test_further_markings_join_the_standard_ones():
@@ -189,12 +212,7 @@ def test_derivatives_of_samples_are_those_of_their_heights():
     assert there - here == pytest.approx(pitch.samples_by_surface(1.0) @ change, abs=1e-12)
 
 
-MATCH = MatchSpec(
-    match_id="m",
-    fps=25,
-    cameras=(CameraSpec(id="cam", width=1920, height=1080),),
-    clips=(ClipSpec(id="clip", frame_count=1),),
-)
+MATCH = match_spec(["cam"])
 
 
 def pitch(template, **dimensions):

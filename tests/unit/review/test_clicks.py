@@ -6,15 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from run_records import correction, match_spec
 
 from data_contracts.broadcast_calibration import KeyFrame, KeyFrames
 from data_contracts.keypoints import KeypointDetections
-from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.review import (
     AddedDetection,
     ChosenFrames,
-    Correction,
     DeletedDetection,
     MovedKeypoint,
     MovedPoint,
@@ -42,16 +41,10 @@ def clicks(*points, drawn=()):
 
 @pytest.fixture(scope="module")
 def folder():
-    cameras = [CameraSpec(id=name, width=100, height=50) for name in ("a", "b")]
-    cameras.append(CameraSpec(id="tv", kind="broadcast", width=200, height=100))
+    cameras = {"a": {}, "b": {}, "tv": {"kind": "broadcast", "width": 200, "height": 100}}
     return MatchFolder(
         folder=Path("m"),
-        spec=MatchSpec(
-            match_id="m",
-            fps=25,
-            cameras=tuple(cameras),
-            clips=(ClipSpec(id="clip", frame_count=9, broadcast="tv"),),
-        ),
+        spec=match_spec(cameras, {"clip": {"frame_count": 9, "broadcast": "tv"}}, size=(100, 50)),
         calibrations={},
         detections={},
         pitch=PitchSpec(),
@@ -70,17 +63,7 @@ def folder():
 
 
 def made(*edits):
-    return [
-        Correction(
-            id=f"c{number}",
-            match_id="m",
-            edit=edit,
-            who="Ada",
-            made_at=datetime(2026, 1, 2, tzinfo=UTC),
-            based_on={},
-        )
-        for number, edit in enumerate(edits)
-    ]
+    return [correction(edit, f"c{number}") for number, edit in enumerate(edits)]
 
 
 def moved(xy, was, camera="a", marking=CORNER, frame=None):
@@ -148,8 +131,8 @@ def test_what_does_not_apply_says_why_and_changes_nothing(folder, edit, reason):
     if reason is None:
         assert replay.stale == ()
         return
-    ((correction, said),) = replay.stale
-    assert correction.edit == edit
+    ((stale, said),) = replay.stale
+    assert stale.edit == edit
     assert reason in said
     assert replay.folder is folder
 
@@ -201,10 +184,10 @@ def interleave(folder, rng):
             )
             count += 1
         else:
-            correction = made(wanted[editor])[0].model_copy(update={"id": f"c{count}"})
+            said = correction(wanted[editor], f"c{count}")
             count += 1
-            if append(store, seen.pop(editor), [correction]) is not None:
-                acknowledged.append(correction)
+            if append(store, seen.pop(editor), [said]) is not None:
+                acknowledged.append(said)
     kept = tuple(read_journal(store, "m").standing.values())
     replay = replay_corrections(folder, kept)
     assert list(kept) == acknowledged, "an acknowledged edit is lost or doubled"

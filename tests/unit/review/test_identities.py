@@ -97,10 +97,7 @@ HERE = Sighting(camera="a", frame=FIRST, detection=0)
         (merge(0, 0), "one person already"),
         (merge(0, 2), "side by side in 3 frames, the first is 100"),
         (merge(1, 0, kept_seen=HERE), "person 1 is not the person that was seen in a, frame 100"),
-        (
-            merge(1, 0, merged_seen=HERE.model_copy(update={"camera": "z"})),
-            "is not the person that was seen",
-        ),
+        (merge(1, 0, merged_seen=HERE.model_copy(update={"camera": "z"})), "is not the person"),
         (split(0, FIRST), "not seen both before and from 100"),
         (split(0, FIRST + 3), "not seen both before and from 103"),
         (split(7, FIRST + 3), "no person 7"),

@@ -5,8 +5,10 @@ from datetime import UTC, datetime
 from multiprocessing import get_context
 
 import pytest
+import run_records
+from run_records import review_request
 
-from data_contracts.review import Correction, MovedPoint, ReviewDecision, ReviewRequest
+from data_contracts.review import MovedPoint, ReviewDecision
 from worldpose.errors import CorruptionError, StoreError
 from worldpose.review.journal import append, last_decision, read_journal, requests_by_id, say
 from worldpose.store.integrity import verify
@@ -16,28 +18,14 @@ NOW = datetime(2026, 1, 2, tzinfo=UTC)
 
 
 def correction(name, x=1.0):
-    return Correction(
-        id=name,
-        match_id="m",
-        edit=MovedPoint(camera="cam00", marking="corner_left_near", was=(0.0, 0.0), xy=(x, 2.0)),
-        who="Ada",
-        made_at=NOW,
-        based_on={},
-    )
+    edit = MovedPoint(camera="cam00", marking="corner_left_near", was=(0.0, 0.0), xy=(x, 2.0))
+    return run_records.correction(edit, name)
 
 
 def request(name, content):
-    return ReviewRequest(
-        id=name,
-        match_id="m",
-        run_id="0001",
-        gate="tracking",
-        keys={"tracking/clip": "0" * 32},
-        contents={"tracking/clip": content},
-        reasons=("undecided is 1, at most 0 passes",),
-        figures={"undecided": 1.0},
-        created_at=NOW,
-    )
+    about = {"reasons": ("undecided is 1, at most 0 passes",), "figures": {"undecided": 1.0}}
+    unit = "tracking/clip"
+    return review_request(name, keys={unit: "0" * 32}, contents={unit: content}, **about)
 
 
 def decision(name, verdict):

@@ -13,12 +13,13 @@ DISTORTION = np.array([-0.12, 0.04, 0.0006, -0.0004, 0.0])
 PLACES = np.mgrid[:7, :4].T.reshape(-1, 2) * 0.06
 
 
-def view(rng, tilt=0.6, noise=0.1, far=0.7):
+def view(rng, tilt=0.6, noise=0.1, far=0.7, bend=0.0):
     """Corners of a tilted board somewhere in the image."""
     turn = rng.uniform(-tilt, tilt, 3)
     middle = np.append(rng.uniform(-0.3, 0.3, 2) * [1.2, 0.6], 1.0) * far
     rotation = cv2.Rodrigues(turn)[0]
-    points = np.column_stack([PLACES - PLACES.mean(axis=0), np.zeros(len(PLACES))])
+    flat = PLACES - PLACES.mean(axis=0)
+    points = np.column_stack([flat, bend * (flat[:, 0] / flat[:, 0].max()) ** 2])
     shown, _ = cv2.projectPoints(
         points @ rotation.T + middle, np.zeros(3), np.zeros(3), MATRIX, DISTORTION
     )
@@ -38,6 +39,15 @@ def test_a_lens_is_found_within_its_stated_uncertainty():
         assert fit.rms_px == pytest.approx(0.1 * np.sqrt(2.0), rel=0.15)
         assert lens.distortion[:2] == pytest.approx(DISTORTION[:2], abs=0.05)
     assert 0.5 < np.sqrt(np.mean(np.square(off))) < 1.8
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.003])
+def test_a_bent_board_is_told_and_widens_the_lens(bend):
+    rng = np.random.default_rng(5)
+    fits = [calibrate_lens("cam", [view(rng, bend=bend) for _ in range(12)], SIZE) for _ in "abcd"]
+    assert [fit.bend_m for fit in fits] == pytest.approx([bend] * 4, abs=1e-4)
+    off = [(fit.lens.focal_px - 900.0) / fit.lens.focal_std_px for fit in fits]
+    assert np.abs(off).max() < 2.0
 
 
 def test_too_few_boards_and_boards_that_face_the_camera_are_refused():

@@ -18,7 +18,7 @@ from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import place_camera
 from worldpose.simulation.settings import ClickSettings
 from worldpose.static_calibration.estimate import calibrate_camera
-from worldpose.static_calibration.evidence import gather_evidence
+from worldpose.static_calibration.evidence import gather_evidence, has_enough_points
 from worldpose.static_calibration.fit import build_problem, compute_residuals
 from worldpose.static_calibration.initialization import camera_from_homography
 from worldpose.static_calibration.settings import StaticCalibrationSettings
@@ -66,6 +66,20 @@ def test_points_on_one_line_are_an_error_and_the_message_names_points_off_it():
         of(people.points(seen))
     # No requested point lies on a goal line.
     assert "back" not in error.value.todo
+
+
+@pytest.mark.parametrize(
+    ("names", "enough"),
+    [
+        (("backboard_left_near_top", "backboard_left_far_top", "restricted_area_left_near_back",
+          "restricted_area_left_far_back"), True),
+        (("halfway_near", "halfway_far", "center_mark", "center_circle_near"), False),
+    ],
+)  # fmt: skip
+def test_points_of_a_hall_are_off_one_line_by_its_size_and_by_their_heights(names, enough):
+    hall = PitchTemplate.from_spec(PitchSpec(template="basketball"))
+    clicked = people.points({name: (400.0 + n, 300.0) for n, name in enumerate(names)})
+    assert has_enough_points(gather_evidence(hall, clicked, SIZE, 0.5, "here")) is enough
 
 
 def test_corners_and_only_the_line_through_them_do_not_determine_a_camera():

@@ -2,14 +2,18 @@
 
 from functools import cache
 
+import clicking_people as people
 import cv2
 import numpy as np
+import pytest
 from camera_builders import look_at_camera
 from clicking_people import pinhole
 
+from data_contracts.pitch import PitchSpec
 from worldpose.body.model import BodyParameters
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
+from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.from_paint.proposal import calibrate_without_clicks
 from worldpose.static_calibration.from_paint.thin_paint import trace_marking
 from worldpose.static_calibration.line_refinement import refine_on_lines
@@ -22,6 +26,7 @@ from worldpose.static_calibration.parameters import (
 
 PITCH = PitchTemplate.standard()
 EXACT = 0.0
+SMALLER = PitchSpec(length=103.0, width=66.5)
 SPREAD = np.array([2e-3, 2e-3, 2e-3, 0.15, 0.15, 0.15, 3e-3, 3.0, 3.0, 0.01, 0.01, 0.0])
 """Of a start from ordinary clicks: a few pixels at most places."""
 
@@ -33,6 +38,28 @@ def camera():
         lens=(-0.08, 0.02, 0.0, 0.0, 0.0),
         roll=0.005,
     )
+
+
+@pytest.mark.parametrize("stated", [None, SMALLER])
+def test_lines_off_their_places_ask_for_the_size_of_an_unmeasured_pitch(stated):
+    true, view = PitchTemplate.from_spec(SMALLER), camera()
+    names = list(true.points)
+    pixels = view.project(true.positions(names)) + np.random.default_rng(0).normal(
+        0, 1, (len(names), 2)
+    )
+    seen = {
+        n: at
+        for n, at in zip(names, pixels, strict=True)
+        if (at > 4).all() and (at < (955, 535)).all()
+    }
+    pitch = PitchTemplate.from_spec(stated or PitchSpec())
+    drawn = render_pitch(view, true, None, 1)
+    report = calibrate_camera(pitch, people.points(seen), (960, 540), picture=drawn).report
+    told = [each for each in report.decisions if "measure length and width" in each]
+    assert [each[:34] for each in told] == (
+        [] if stated else ["the painted lines lie 2.2 cm off t"]
+    )
+    assert not report.weak
 
 
 def standing(x, y):

@@ -118,14 +118,16 @@ def test_an_image_without_a_green_pitch_is_refused(picture, message):
         propose_camera(picture, PITCH, side="near")
 
 
-def test_markings_lie_on_paint_for_the_right_camera_alone():
-    share = paint_share(still(), camera(), PITCH)
+@pytest.mark.parametrize("dark", [False, True])
+def test_markings_lie_on_paint_for_the_right_camera_alone(dark):
+    picture = 255 - still() if dark else still()
+    share = paint_share(picture, camera(), PITCH)
     assert share is not None
     assert share > 0.9
-    other = paint_share(still(), camera((10.0, -55.0, 15.0), (-25.0, 4.0, 0.0)), PITCH)
+    other = paint_share(picture, camera((10.0, -55.0, 15.0), (-25.0, 4.0, 0.0)), PITCH)
     assert other is not None
     assert other < 0.4
-    assert paint_share(still(), camera(aim=(-24.0, -160.0, 0.0)), PITCH) is None
+    assert paint_share(picture, camera(aim=(-24.0, -160.0, 0.0)), PITCH) is None
 
 
 SECONDS = np.arange(6.0)

@@ -6,11 +6,11 @@ import tempfile
 from typing import Any
 
 import numpy as np
-from run_records import run_record
+from run_records import match_spec, run_record
 
 import data_contracts.arrays
 from data_contracts.arrays import GroupLayout, array_layout
-from data_contracts.match import CameraSpec, ClipSpec, MatchSpec, Registration, SourceFile
+from data_contracts.match import Registration, SourceFile
 from data_contracts.work import Recipe, Work
 from worldpose.store.blobs import install_fault_hook
 from worldpose.store.recipes import recipe_key
@@ -123,12 +123,7 @@ def run_once(store, *recipes):
 
 
 def sample_registration(match_id="final", folder="/match"):
-    spec = MatchSpec(
-        match_id=match_id,
-        fps=50,
-        cameras=(CameraSpec(id="left", width=1920, height=1080),),
-        clips=(ClipSpec(id="clip", frame_count=FRAMES),),
-    )
+    spec = match_spec(["left"], {"clip": {"frame_count": FRAMES}}, match_id=match_id)
     source = SourceFile(path="match.yaml", size=3, modified_ns=1, sha256="c" * 64)
     return Registration(spec=spec, folder=folder, identity="d" * 64, files=(source,))
 
