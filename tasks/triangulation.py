@@ -108,7 +108,7 @@ def _write_joints(
             sums.append(sum_joints(clip.cameras, seen, joints, part.frames.start, fps, bins))
             agreements.append(part.triangulation.agreement)
             changes.append(part.smoothing.changes)
-        equations = ChangeSums.join(sums, cameras, fps)
+        equations = ChangeSums.join(sums, clip.cameras, fps)
         measured = _health_arrays(inputs, clip, health, equations, rows, result)
         found = _find_changes(inputs, clip, health, equations, kinds, rows, result)
         result.write(

@@ -208,7 +208,7 @@ def sum_clip(
         joints = np.full((len(seen.detection_index), seen.detection_index.shape[2], 17, 3), np.nan)
         joints[used] = triangulate_views(rig, seen[used], settings)
         sums.append(sum_joints(cameras, seen, joints, begun, fps, (length, every), settings))
-    return ChangeSums.join(sums, len(cameras.focal), fps)
+    return ChangeSums.join(sums, cameras, fps)
 
 
 def place_steps(

@@ -35,11 +35,11 @@ from worldpose.triangulation.synchronization import PRIOR
 MIN_SIZE: Final = {
     ("clock", "drift"): 0.4,
     ("clock", "step"): 0.6,
-    ("view", "drift"): 5e-4,
-    ("view", "step"): 2e-3,
+    ("view", "drift"): 1.0,
+    ("view", "step"): 4.0,
 }
 """Least size of a part: of a clock [frame], as a recorder loses whole frames, and the errors that
-views share differ between the ends of a clip; of a view [rad], a tenth of a degree."""
+views share differ between the ends of a clip; of a view [px]."""
 MAX_VIEW: Final = np.array([0.2, 0.2, 0.2, 0.1])
 """Most that a view moves: rotation [rad] and growth [1]. People who agree nowhere show more."""
 MIN_GAIN: Final[dict[Kind, float]] = {"clock": 30.0, "view": 60.0}
@@ -84,14 +84,17 @@ class Part:
         """The unknowns that change."""
         return WIDTH * self.camera + UNKNOWNS[self.kind]
 
-    @property
-    def is_usual(self) -> bool:
-        """Whether the size is large enough to matter, and a camera can change so."""
+    def is_usual(self, focal: float) -> bool:
+        """Return whether the size is large enough to matter, and a camera can change so.
+
+        Args:
+            focal: focal length of the camera [px].
+        """
         least = MIN_SIZE.get((self.kind, self.shape), 0.0)
         if self.kind == "clock":
             return abs(self.size[0]) >= least
         # Roll and growth move what is seen 0.3 rad from the axis, the usual place.
-        size = np.linalg.norm(self.size * np.array([1.0, 1.0, 0.3, 0.3]))
+        size = focal * np.linalg.norm(self.size * np.array([1.0, 1.0, 0.3, 0.3]))
         return bool(size >= least and (np.abs(self.size) < MAX_VIEW).all())
 
     def share(self, rows: Floats | Integers, frames: int) -> Floats:
@@ -335,7 +338,7 @@ class _Fit:
         part = self.sized()[k]
         if part.shape == "constant":
             return np.inf
-        if not part.is_usual or self._returns(part):
+        if not part.is_usual(self.sums.focal[part.camera]) or self._returns(part):
             return 0.0
         usual = noise[part.kind, part.shape == "drift"][part.camera]
         own = self.sizes_of(k)

@@ -48,6 +48,7 @@ class ChangeSums:
         score: (bins, unknowns).
         rows: (bins,) middle of each bin [frame].
         fps: [1/s].
+        focal: (cameras,) focal lengths [px].
         are_clocks_asked: a user asks for changes of clocks, and sees the evidence: the noise of a
             clock is that of seconds about their neighbours.
     """
@@ -56,17 +57,19 @@ class ChangeSums:
     score: Floats
     rows: Floats
     fps: float
+    focal: Floats
     are_clocks_asked: bool = False
 
     @classmethod
-    def join(cls, parts: Sequence[ChangeSums], cameras: int, fps: float) -> Self:
-        """Return the equations of several stretches of a clip."""
-        size = WIDTH * cameras
+    def join(cls, parts: Sequence[ChangeSums], cameras: Camera, fps: float) -> Self:
+        """Return the equations of several stretches of a clip, of a batch of cameras."""
+        size = WIDTH * len(cameras.focal)
         return cls(
             np.concatenate([np.zeros((0, size, size)), *(one.matrix for one in parts)]),
             np.concatenate([np.zeros((0, size)), *(one.score for one in parts)]),
             np.concatenate([np.zeros(0), *(one.rows for one in parts)]),
             fps,
+            cameras.focal.mean(axis=-1),
         )
 
     @property
@@ -229,11 +232,11 @@ def sum_joints(
     rig = Rig.from_cameras(cameras)
     moving = MovingJoints.at_rows(rig, people, limbs, rows, half_window(fps), settings)
     if not len(moving.at):
-        return ChangeSums.join([], len(cameras.focal), fps)
+        return ChangeSums.join([], cameras, fps)
     number = (start + moving.frame) // length
     added = sum_equations(replace(moving, person=number), with_cameras=True)
     middles = np.asarray(np.unique(number) * length + 0.5 * (length - 1), np.float64)
-    return ChangeSums(added.information, added.score, middles, fps)
+    return ChangeSums(added.information, added.score, middles, fps, cameras.focal.mean(axis=-1))
 
 
 def half_window(fps: float) -> int:

@@ -314,5 +314,7 @@ def test_cameras_that_all_sway_agree_with_nobody(cameras):
 def test_a_step_that_covers_a_short_clip_stays_as_it_is():
     parts = [Part(0, "constant", 0, (0.0,)), Part(0, "step", 12, (12.0,))]
     rows = np.arange(2.0, 25.0, 5.0)
-    sums = ChangeSums(np.tile(np.eye(5), (len(rows), 1, 1)), np.zeros((len(rows), 5)), rows, 25.0)
+    sums = ChangeSums(
+        np.tile(np.eye(5), (len(rows), 1, 1)), np.zeros((len(rows), 5)), rows, 25.0, np.ones(1)
+    )
     assert fit_parts(sums, parts, 25, ("clock",)) == parts
