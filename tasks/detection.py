@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -42,10 +42,7 @@ def detection(inputs: UnitInputs, result: ResultWriter) -> None:
         found = _open_uncorrected(inputs) if edits else None
         found = found or _detect_people(inputs, spool)
         result.figures |= found.figures | _longest_gap(found.unreadable)
-        settings = inputs.settings(DetectionSettings)
-        is_given = "boxes" in inputs.sources
-        warnings = [*found.warnings, *([] if is_given else _warn_of_size(found, settings))]
-        result.warnings += [f"{inputs.recipe.name}: {each}." for each in warnings]
+        result.warnings += found.warnings
         detections = found.detections
         if edits:
             replay = replay_detections(detections, edits)
@@ -72,14 +69,14 @@ class _Found:
         images: `IMAGE_ARRAYS` of the frames, by name.
         unreadable: [first, last] of each interval of frames without an image.
         figures: metrics.
-        warnings: sentences without the unit and the full stop.
+        warnings: sentences of the unit.
     """
 
     detections: KeypointDetections
     images: dict[str, Singles]
     unreadable: list[list[int]]
     figures: dict[str, float]
-    warnings: list[str]
+    warnings: Sequence[str]
 
 
 def _longest_gap(unreadable: list[list[int]]) -> dict[str, float]:
@@ -90,10 +87,10 @@ def _longest_gap(unreadable: list[list[int]]) -> dict[str, float]:
     return {"unreadable_from_frame": first, "unreadable_to_frame": last}
 
 
-def _warn_of_size(found: _Found, settings: DetectionSettings) -> list[str]:
+def _warn_of_size(detections: KeypointDetections, settings: DetectionSettings) -> list[str]:
     """Return a sentence if people are larger than those whom the bundled detector knows."""
     largest = 2 * 160.0  # twice the tallest people of its training [px]
-    boxes, score = np.asarray(found.detections.boxes), np.asarray(found.detections.score)
+    boxes, score = np.asarray(detections.boxes), np.asarray(detections.score)
     heights = (boxes[..., 3] - boxes[..., 1])[score >= 0.3]
     if settings.detector != DetectionSettings().detector or not len(heights):
         return []
@@ -115,7 +112,9 @@ def _open_uncorrected(inputs: UnitInputs) -> _Found | None:
     stored, manifest = published
     detections = KeypointDetections.from_arrays(stored)
     images = {array.name: stored[array.name].values for array in IMAGE_ARRAYS}
-    return _Found(detections, images, stored.attrs["unreadable"], dict(manifest.figures), [])
+    return _Found(
+        detections, images, stored.attrs["unreadable"], dict(manifest.figures), manifest.warnings
+    )
 
 
 def _detect_people(inputs: UnitInputs, spool: Spool) -> _Found:
@@ -139,7 +138,10 @@ def _detect_people(inputs: UnitInputs, spool: Spool) -> _Found:
     unreadable = report.unreadable
     told = [reason] if (reason := report.why_no_person()) else []
     if report.cut:
-        told.append(f"{report.cut} people beyond detection.max_people of a frame were left out")
+        told.append(
+            f"in {report.cut} frames, people beyond the {settings.max_people} of "
+            "detection.max_people were left out"
+        )
     if len(unreadable) == report.frames and not _has_images(inputs):
         unreadable, told = [], ["the camera does not film this clip"]
     elif len(unreadable) == report.frames:
@@ -149,14 +151,16 @@ def _detect_people(inputs: UnitInputs, spool: Spool) -> _Found:
             found=f"none in {report.frames} frames",
             todo="Convert the video with any video tool, and give that one.",
         )
+    detections = KeypointDetections.from_arrays(
+        {
+            "frame": inputs.frames,
+            **{name: values[:, :most] for name, values in spool.arrays().items()},
+            **({} if landmarks is None else {"point": landmarks.points}),
+        }
+    )
+    told += [] if report.is_given else _warn_of_size(detections, settings)
     return _Found(
-        KeypointDetections.from_arrays(
-            {
-                "frame": inputs.frames,
-                **{name: values[:, :most] for name, values in spool.arrays().items()},
-                **({} if landmarks is None else {"point": landmarks.points}),
-            }
-        ),
+        detections,
         {
             array.name: np.array(values, dtype=np.float32)
             for array, values in zip(IMAGE_ARRAYS, zip(*quality, strict=True), strict=True)
@@ -175,7 +179,7 @@ def _detect_people(inputs: UnitInputs, spool: Spool) -> _Found:
             "flicker_share": report.flickers / max(1, report.detections),
             **report.speed(),
         },
-        told,
+        [f"{inputs.recipe.name}: {each}." for each in told],
     )
 
 

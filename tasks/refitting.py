@@ -175,7 +175,7 @@ def _known_shapes(
         inputs: the unit.
         before: what `fitted` was computed from.
         fitted: bodies of this clip.
-        result: gets a warning of every name without a person, or of different people.
+        result: gets a warning of every name of different people.
     """
     named: dict[str, dict[str, str]] = dict(inputs.sources["people"])
     here, own = named.pop(inputs.unit), _fitted_shapes(fitted)
@@ -188,11 +188,7 @@ def _known_shapes(
 
     known, ids = {}, fitted["person"].values.tolist()
     for person, name in here.items():
-        if int(person) not in ids:
-            result.warnings.append(
-                f"clip {inputs.unit} has no fitted person {person}, named {name}; its people are "
-                f"{', '.join(map(str, ids)) or 'none'}. Correct the clip's `people` in match.yaml."
-            )
+        if int(person) not in ids:  # tracked without a body, or told with the run's names
             continue
         shapes = []
         for clip, people in named.items():

@@ -60,8 +60,9 @@ def names_said(match: Match) -> str:
 def names_of(run: Run, clip: str) -> dict[int, str]:
     """Return the newest names of a run's people by id.
 
-    A name belongs to no result: over the names that match.yaml states now, the journal's are
-    replayed, in order with the merges and splits that the tracks of the run contain.
+    A name belongs to no result: the journal's names are replayed in order with the merges and
+    splits that the tracks of the run contain. Whom they do not decide has the name that match.yaml
+    states now, by id: only if these are the tracks of the latest run.
     """
     return _replay_names(run, clip)[1]
 
@@ -69,7 +70,8 @@ def names_of(run: Run, clip: str) -> dict[int, str]:
 def lost_names(run: Run) -> dict[str, str]:
     """Return why names fit no person of a run any more, by the ids of their corrections.
 
-    Names of match.yaml have clip and person for an id. A name that another person got is not lost.
+    Names of match.yaml have clip and person for an id, those for the tracks of a later run the
+    clip. A name that another person got is not lost.
     """
     lost: dict[str, str] = {}
     for unit, key in run.record.results.items():
@@ -85,16 +87,23 @@ def _replay_names(run: Run, clip: str) -> tuple[dict[str, str], dict[int, str]]:
     """Return lost names with the reasons, by correction, and all others by person."""
     match_id, unit = run.record.match_id, f"tracking/{clip}"
     journal, stated = read_journal(run.store, match_id), _stated_names(run.store, match_id, clip)
+    plane, lost = f"broadcast_tracking/{clip}", dict[str, str]()
+    latest = run.store.run(match_id).results if stated else {}
+    if stated and any(latest.get(n) != run.record.results.get(n) for n in (unit, plane)):
+        stated = {}
+        lost[clip] = (
+            f"the names of clip {clip} in match.yaml belong to the people of the latest run, and "
+            "this run has other tracks: they are left out. Open the latest run"
+        )
     if unit not in run:
-        plane = f"broadcast_tracking/{clip}"
         ids = run[plane]["person"].values.tolist() if plane in run else [*stated]
         names = {person: name for person, name in stated.items() if person in ids}
-        return _lost_stated(clip, stated, ids, names), names
+        return lost | _lost_stated(clip, stated, ids, names), names
     if not stated and not any(
         isinstance(each.edit, NamedTrack) and each.edit.clip == clip
         for each in journal.standing.values()
     ):
-        return {}, {}
+        return lost, {}
     moves = run.manifest(unit).recipe.sources.get("identities") or []
     assert isinstance(moves, list)
     said: dict[str, IdentityEdit] = {}
@@ -110,9 +119,8 @@ def _replay_names(run: Run, clip: str) -> tuple[dict[str, str], dict[int, str]]:
     edits = list(said.values())
     taken = moved if stored.edits else []
     replay = _replay(stored, edits, taken, stated, with_joints=False)
-    ids = replay.identities.person.tolist()
-    names = {person: name for person, name in replay.identities.names.items() if person in ids}
-    lost = {
+    ids, names = replay.identities.person.tolist(), replay.identities.names
+    lost |= {
         name: f"{edit.name!r} names no person: {why}. Name the person again, or withdraw the name"
         for (name, edit), why in zip(said.items(), replay.objections, strict=True)
         if isinstance(edit, NamedTrack) and edit.name and why and edit.name not in names.values()
@@ -149,7 +157,8 @@ def _replay(
 ) -> IdentityReplay:
     """Replay corrections over a result that contains the merges and splits `taken` already.
 
-    People have the names `stated` before. The objections are in the order of `said`.
+    People whom no correction names, or leaves without a name, have the names `stated`. The
+    objections are in the order of `said`.
     """
     merged, others = dict[int, IdentityEdit](), dict[int, IdentityEdit]()
     for number, edit in enumerate(said):
@@ -165,11 +174,22 @@ def _replay(
         elif edit not in taken:
             others[number] = edit
     tracks = stored_identities(stored.result, with_joints=with_joints)
-    tracks = replace(tracks, names=dict(stated))
     order = merged | others  # a person's own name counts more
     replay = replay_identities(tracks, order.values())
     found = dict(zip(order, replay.objections, strict=True))
-    return replace(replay, objections=tuple(found.get(number) for number in range(len(said))))
+    gone = {move.merged: at for at, move in enumerate(said) if isinstance(move, MergedTracks)}
+    nameless = {
+        edit.person
+        for number, edit in others.items()
+        if isinstance(edit, NamedTrack) and edit.name is None and found[number] is None
+        if gone.get(edit.person, -1) < number  # later a split can give the id to another person
+    }
+    now = replay.identities
+    left = {who: name for who, name in stated.items() if who in now.person and who not in nameless}
+    return IdentityReplay(
+        replace(now, names=left | now.names),
+        tuple(found.get(number) for number in range(len(said))),
+    )
 
 
 def require_fitting(store: Store, match: Match, edits: Sequence[Edit]) -> None:

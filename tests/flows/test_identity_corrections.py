@@ -160,15 +160,20 @@ def test_a_name_whose_detection_is_gone_is_reported_until_it_is_given_again(stor
     assert lost_names(run) == {}
 
 
+def state(store, people):
+    """Name people in match.yaml."""
+    registration = store.registration(TINY)
+    (clip,) = registration.spec.clips
+    named = clip.model_copy(update={"people": people})
+    roster = tuple(PlayerSpec(id=name) for name in people.values())
+    spec = registration.spec.model_copy(update={"clips": (named,), "roster": roster})
+    store.register(registration.model_copy(update={"spec": spec}))
+
+
 def test_names_of_the_match_folder_are_those_of_people_until_a_page_gives_others(store):
     found = identities_now(store, open_match(store, TINY), "clip").identities
     one, other = found.person.tolist()[:2]
-    registration = store.registration(TINY)
-    (clip,) = registration.spec.clips
-    named = clip.model_copy(update={"people": {one: "ann", other: "bea", 99: "cleo"}})
-    roster = tuple(PlayerSpec(id=name) for name in named.people.values())
-    spec = registration.spec.model_copy(update={"clips": (named,), "roster": roster})
-    store.register(registration.model_copy(update={"spec": spec}))
+    state(store, {one: "ann", other: "bea", 99: "cleo"})
     run = Run(store, store.run(TINY))
     assert clip_positions(run, "clip").names[:2] == ["ann", "bea"]
     (said,) = lost_names(run).values()
@@ -178,6 +183,30 @@ def test_names_of_the_match_folder_are_those_of_people_until_a_page_gives_others
     say(store, b=NamedTrack(clip="clip", person=other, name=None))
     assert names_of(run, "clip") == {one: "Ann"}
     assert identities_now(store, open_match(store, TINY), "clip").identities.names[one] == "Ann"
+
+
+def test_names_of_the_match_folder_are_of_the_people_after_merges_and_in_no_other_run(store):
+    found = identities_now(store, open_match(store, TINY), "clip").identities
+    (one, other), new = found.person.tolist()[:2], int(found.person.max()) + 1
+
+    def names_now():
+        match = open_match(store, TINY)  # which reads match.yaml again
+        state(store, {one: "ann", other: "bea", new: "dora"})
+        return identities_now(store, match, "clip").identities.names
+
+    middle = int(found.frame[len(found.frame) // 2])
+    say(store, a=SplitTrack(clip="clip", person=one, first_frame_of_new=middle))
+    say(store, b=NamedTrack(clip="clip", person=new, name="Bob"))
+    say(store, c=MergedTracks(clip="clip", kept=one, merged=new))
+    assert names_now() == {one: "Bob", other: "bea"}
+    say(store, d=SplitTrack(clip="clip", person=one, first_frame_of_new=middle + 1))
+    record, unit = store.run(TINY), planned(store)
+    compute(store, unit)
+    results = {**record.results, "tracking/clip": unit.key}
+    run = Run(store, record.model_copy(update={"results": results}))
+    assert names_now() == {one: "Bob", other: "bea", new: "dora"}
+    assert names_of(run, "clip") == {one: "Bob"}
+    assert "this run has other tracks" in lost_names(run)["clip"]
 
 
 def test_every_door_refuses_what_does_not_fit_the_results(store):

@@ -159,6 +159,7 @@ def test_a_corrected_detection_is_the_same_whether_or_not_the_nets_look_again(
 ):
     edit = DeletedDetection(camera="left", frame=4, detection=0)
     said = correction(edit, match_id="filmed")
+    monkeypatch.setattr(DetectionReport, "why_no_person", lambda self: "told")
     stages = [stage.name for stage in METHOD].index("detection") + 1
     found = []
     for project in ("fresh", "kept"):
@@ -177,6 +178,7 @@ def test_a_corrected_detection_is_the_same_whether_or_not_the_nets_look_again(
     (fresh, score), (kept, _) = found
     assert np.isnan(score[:, 0]).tolist() == [n == 4 - 2 for n in range(12)]
     assert fresh.content == kept.content
+    assert fresh.warnings == kept.warnings == ("detection/left.early: told.",)
     speed = DetectionReport().speed()  # each run has its own
     metrics = [{k: v for k, v in each.figures.items() if k not in speed} for each in (fresh, kept)]
     assert (metrics[0], fresh.figures["corrections_refused"]) == (metrics[1], 0)

@@ -61,6 +61,9 @@ def fit_bodies(
         settings: expected errors of detectors, bodies and motion.
         ground: height of the surface under the feet, in a world with z up; None where unknown.
         known_shapes: shapes of people from other clips, by their index in the joints.
+
+    Raises:
+        InputError: a covariance is smaller than the square of `common_bias`, its part.
     """
     parts = fit_in_windows(model, evidence, settings, ground, known_shapes)
     return BodyFit.concatenate([fit for _, fit in parts])
@@ -105,6 +108,7 @@ def _learn_clip(
     points: dict[str, None] = {}
     for part in parts:
         some = evidence.read_joints(part)
+        some.require_bias()
         seen[part] = some.joint_seen.any(-1)
         if some.extra is not None:
             names = known_points(solver.chained.model, some.extra.points)

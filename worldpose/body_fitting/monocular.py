@@ -52,7 +52,7 @@ def read_monocular(path: Path) -> MonocularEstimates:
     (`global_orient` and `body_pose`). The position of a body comes from its crop (`box_center`,
     `bbox`: weak perspective, whose scale and offset are not needed) or from its position in front
     of the camera (`transl` with `focal_length` and `img_size`: full perspective). Boxes are
-    centers, or x0 y0 x1 y1 with or without a score, or VIBE's `bboxes` with `frame_ids`: center,
+    centers, or x0 y0 x1 y1 and anything after them, or VIBE's `bboxes` with `frame_ids`: center,
     width and height. `frame` gives the rows' frames; without it each row is a frame of its own.
 
     Args:
@@ -96,8 +96,11 @@ def parse_monocular(arrays: Mapping[str, NDArray[Any]], where: Path) -> Monocula
         rotations = _rotation_matrices(whole, where, "rotations", JOINTS)
     rows = len(rotations)
     frame = _first_present(arrays, ("frame", "frames", "frame_ids"))
-    frame = np.arange(rows) if frame is None else frame.ravel()
-    if frame.dtype.kind not in "iuf" or (frame != np.rint(frame)).any() or np.isinf(frame).any():
+    try:
+        frame = np.arange(rows) if frame is None else frame.ravel().astype(np.float64)
+    except ValueError:  # text that is no number
+        frame = np.full(rows, np.nan)
+    if (frame != np.rint(frame)).any() or np.isinf(frame).any():
         raise _format_error(where, "whole frame numbers", f"others among {len(frame)}")
     # Crops have centers or boxes; whole images positions in front of the camera [m].
     crop = _first_present(arrays, ("box_center", "bbox", "bboxes"))
@@ -132,8 +135,8 @@ def _box_centers(boxes: Floats, where: Path, is_vibe: bool) -> Floats:
     width = boxes.shape[1] if boxes.ndim == 2 else 0
     if width == 2 or (width == 4 and is_vibe):
         return boxes[:, :2]
-    if width not in (4, 5) or (boxes[:, 2:4] < boxes[:, :2]).any():  # NaN: no box
-        expected = "centers, or boxes x0 y0 x1 y1 with or without a score, x1 >= x0 and y1 >= y0"
+    if width < 4 or (boxes[:, 2:4] < boxes[:, :2]).any():  # NaN: no box
+        expected = "centers, or boxes x0 y0 x1 y1 (score, class, ...), x1 >= x0 and y1 >= y0"
         raise _format_error(where, expected, f"shape {boxes.shape} or other corners")
     return 0.5 * (boxes[:, :2] + boxes[:, 2:4])
 

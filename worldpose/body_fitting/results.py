@@ -61,8 +61,7 @@ class ClipEvidence:
         extra: points besides COCO-17 of the same frames and persons; None = none.
 
     Raises:
-        InputError: the shapes do not match, `fps` is not positive, or `covariance` is smaller than
-            the square of `common_bias`.
+        InputError: the shapes do not match, or `fps` is not positive.
     """
 
     joints: Floats
@@ -86,6 +85,11 @@ class ClipEvidence:
                 todo="Give triangulated joints with their covariance.",
             )
         row_rate("body fitting", self.fps)
+
+    def require_bias(self) -> None:
+        """Raise InputError if `covariance` is smaller than the square of `common_bias`."""
+        if not self.bias.any():
+            return
         left = random_covariance(self.covariance, self.bias)[self.joint_seen]
         total = np.trace(self.covariance[self.joint_seen], axis1=-2, axis2=-1)
         # Numbers of a file are rounded to float32.

@@ -20,6 +20,9 @@ PLACE_NOISE: Final = 1.0 / 20.0
 SPEED_NOISE: Final = 1.0 / 160.0
 """Standard deviation of their change per frame, over the height [1/frame]; ByteTrack's."""
 
+MOST_WAITING: Final = 32
+"""Frames that wait for a batch of detectors, if `stride` or `batch` is not larger: 0.8 GB of 4K."""
+
 _STEP = np.eye(8) + np.eye(8, k=4)
 """Transition matrix: speeds move positions."""
 
@@ -136,10 +139,11 @@ def _as_boxes(means: Floats) -> Floats:
 
 @dataclass
 class _BufferedFrame:
-    """A buffered frame whose gaps may still be filled."""
+    """A buffered frame whose gaps may still be filled; `searched` frames lie up to it."""
 
     number: int
     image: Image | None
+    searched: int = 0
     boxes: dict[int, tuple[Floats, float]] = field(default_factory=dict)
 
 
@@ -173,15 +177,18 @@ class BoxCleaner:
         Args:
             frames: rising numbers, images, and detections; None where no detector ran.
         """
-        settings = self._settings
-        gap = max(settings.max_gap_frames, settings.stride)
-        # A frame is held until a track that begins there can have all of its sightings.
-        lag = max(gap, settings.stride * (settings.min_hits - 1))
+        gap, later = self._settings.longest_gap, self._settings.min_hits - 1
         for number, image, people in frames:
             self._held.append(_BufferedFrame(number, image))
             if people is not None:
                 self._add_detections(number, people, gap)
-            while self._held and number - self._held[0].number >= lag:
+            self._held[-1].searched = self._searched
+            # A frame is held until a track that begins there can have all of its sightings.
+            while (
+                self._held
+                and number - self._held[0].number >= gap
+                and self._searched - self._held[0].searched >= later
+            ):
                 yield self._release_frame()
         while self._held:
             yield self._release_frame()
@@ -237,22 +244,26 @@ class BoxCleaner:
 def detect_strided(
     frames: Iterable[tuple[int, Image | None]],
     detect: Callable[[list[Image]], list[People]],
-    stride: int,
-    batch: int,
+    settings: DetectionSettings,
 ) -> Iterator[tuple[int, Image | None, People | None]]:
     """Yield each frame with its detections; detectors run on every `stride`-th and the last one.
 
-    In place of one without an image, they run on the frames before and after it.
+    In place of one without an image, they run on the next one, and on the one before where the
+    tracks could not be filled from run to run.
 
     Args:
         frames: rising numbers with images; None where there is none.
         detect: detects people in images of one size.
-        stride: frames between runs of the detector.
-        batch: most images per call of the detector; fewer where many frames lie between.
+        settings: stride, batch and longest gap.
     """
     waiting: list[tuple[int, Image | None]] = []
     chosen: list[int] = []
-    due: int | None = None
+    searched: int | None = None
+
+    def choose_last_image() -> None:
+        last = next((k for k in reversed(range(len(waiting))) if waiting[k][1] is not None), None)
+        if last is not None and last not in chosen:
+            chosen.append(last)
 
     def iterate_found() -> Iterator[tuple[int, Image | None, People | None]]:
         images = [image for at in chosen if (image := waiting[at][1]) is not None]
@@ -263,17 +274,17 @@ def detect_strided(
         chosen.clear()
 
     for number, image in frames:
-        waiting.append((number, image))
-        if due is not None and number < due:
+        if image is None or (searched is not None and number < searched + settings.stride):
+            waiting.append((number, image))
             continue
-        if image is not None:
-            chosen.append(len(waiting) - 1)
-            due = number + stride
-        elif len(waiting) > 1 and waiting[-2][1] is not None and len(waiting) - 2 not in chosen:
-            chosen.append(len(waiting) - 2)
-        if len(chosen) == batch or (image is not None and len(waiting) >= max(batch, stride)):
+        if searched is not None and number - searched > settings.longest_gap:
+            choose_last_image()
+            if len(chosen) == settings.batch:
+                yield from iterate_found()
+        waiting.append((number, image))
+        choose_last_image()
+        searched = number
+        if len(chosen) == settings.batch or len(waiting) >= max(settings.batch, MOST_WAITING):
             yield from iterate_found()
-    last = next((at for at in reversed(range(len(waiting))) if waiting[at][1] is not None), None)
-    if last is not None and last not in chosen:
-        chosen.append(last)  # so that boxes reach the last frame
+    choose_last_image()  # so that boxes reach the last frame
     yield from iterate_found()

@@ -20,6 +20,11 @@ from worldpose.parsing import parse_in_turn
 
 STRIDES: Final = ((8, 16, 32), (8, 16, 32, 64))
 """Strides of the grids of YOLO nets, without and with a fourth level [px]."""
+PERSON_NAMES: Final = frozenset(
+    {"goalkeeper", "keeper", "player", "players", "referee"}
+    | {"human", "pedestrian", "people", "person"}
+)
+"""Names of classes of people."""
 Outputs = Sequence[NDArray[Any]]
 Decoder = Callable[[Outputs, tuple[int, int], Sequence[int]], People]
 
@@ -183,12 +188,19 @@ def _class_names(metadata: Mapping[str, str]) -> dict[int, str]:
     """Return the class names that an exporter wrote into the file; {} if there are none."""
     try:
         names = parse_in_turn(lambda: ast.literal_eval(metadata.get("names", "{}")))
-        pairs = list(names.items() if isinstance(names, dict) else enumerate(names))
+        if isinstance(names, list | tuple):
+            names = dict(enumerate(names))
+        pairs = list(names.items()) if isinstance(names, dict) else []
         if all(isinstance(name, int) for _, name in pairs):  # numbers by name
             pairs = [(number, name) for name, number in pairs]
         return {int(number): str(name) for number, name in pairs}
     except (SyntaxError, ValueError, TypeError):
         return {}
+
+
+def select_named_people(names: Mapping[int, str]) -> tuple[int, ...]:
+    """Return the classes whose names are those of people."""
+    return tuple(k for k, name in names.items() if name.lower() in PERSON_NAMES)
 
 
 def find_person_classes(
@@ -211,18 +223,17 @@ def find_person_classes(
                 todo="Correct detection.person_classes.",
             )
         return tuple(asked)
-    # Classes of people in nets that name their classes.
-    person_names = frozenset({"goalkeeper", "keeper", "person", "player", "referee"})
-    people = tuple(k for k, name in names.items() if name.lower() in person_names)
-    if people:
+    if people := select_named_people(names):
         return people
+    if (count or len(names)) == 1:  # whatever its name
+        return (0,) if count else tuple(names)
     # Class of people by number of classes: COCO's 80, its 91 numbered ones, and these with a last
     # class for no object.
     coco_person = {80: 0, 91: 1, 92: 1}
     if names or (count is not None and count > 1 and count not in coco_person):
         raise InputError(
             where,
-            expected="a class of people: " + ", ".join(sorted(person_names)),
+            expected="a class of people: " + ", ".join(sorted(PERSON_NAMES)),
             found=", ".join(f"{k} {name}" for k, name in names.items())
             or f"{count} classes without names",
             todo="Set detection.person_classes to the numbers of these classes, "

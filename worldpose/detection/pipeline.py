@@ -101,7 +101,7 @@ class DetectionReport:
         bridged: boxes that were filled in.
         flickers: boxes of tracks with too few sightings.
         unsure: people without a single keypoint, or with the pose of a better box.
-        cut: people beyond `max_people` in a frame.
+        cut: frames in which people beyond `max_people` were left out.
         beside: occluded people found next to others; later steps may drop some.
         is_given: whether the boxes were given, not detected.
         quarters: turns of the images by 90 degrees, counterclockwise, for the nets.
@@ -289,12 +289,7 @@ class PeopleFinder:
             self._parts = expect_parts(place.camera, place.pitch, margin)
         if given is None:
             found = cleaner.clean(
-                detect_strided(
-                    frames,
-                    lambda images: self._people(images, place),
-                    self._settings.stride,
-                    self._settings.batch,
-                )
+                detect_strided(frames, lambda images: self._people(images, place), self._settings)
             )
         else:
             found = ((number, image, given.get(number, NO_PEOPLE)) for number, image in frames)
@@ -369,6 +364,8 @@ class PeopleFinder:
         People without keypoints, or with the pose of a better box, are dropped.
         """
         settings = self._settings
+        if self.report.is_given:  # those found beside them would displace some
+            settings = settings.model_copy(update={"find_occluded": False})
         images = [image for image, _ in batch if image is not None]
         people = [people for image, people in batch if image is not None]
         found = find_poses(self._estimator, images, people, settings)
@@ -382,7 +379,7 @@ class PeopleFinder:
             distinct = suppress_poses(near, settings.min_keypoint_confidence, settings.oks_nms)
             self.report.unsure += len(near.score) - len(distinct.score)
             best = np.sort(np.argsort(-distinct.score, kind="stable")[: self._most])
-            self.report.cut += len(distinct.score) - len(best)
+            self.report.cut += len(best) < len(distinct.score)
             chosen = distinct.select(best)
             if self._score_map is not None:
                 chosen = replace(chosen, score=self._score_map.probability(chosen.score))

@@ -31,8 +31,8 @@ class DetectionSettings(Record):
     person_classes: tuple[ClassNumber, ...] | None = Field(
         default=None, min_length=1, max_length=100
     )
-    """Classes of people in ONNX and transformers detectors [1]; None: those whose names say so, or
-    COCO's person."""
+    """Classes of people in ONNX detectors, and in transformers detectors whose names tell none [1];
+    None: those whose names say so, or COCO's person."""
     pose: str = "embedded"
     """Estimator of keypoints, named in the same way."""
     flip_test: bool = False
@@ -43,7 +43,8 @@ class DetectionSettings(Record):
     half: bool = False
     """Half precision, on a GPU only."""
     batch: int = Field(default=8, ge=1, le=1000)
-    """Frames per detector batch [1]; bounds memory, changes no result."""
+    """Frames per detector batch [1]; bounds memory, changes no result. With `stride`, batches are
+    smaller where more than 32 frames would wait for a full one."""
     stride: int = Field(default=1, ge=1, le=100)
     """People are detected in every `stride`-th frame; boxes between are interpolated linearly
     [frame]. Keypoints are estimated in every frame."""
@@ -69,7 +70,7 @@ class DetectionSettings(Record):
     are buffered for as long, which costs memory. A third of a second is a step of a sprint."""
     min_hits: int = Field(default=2, ge=1, le=1000)
     """A track with fewer sightings, where as many frames were searched, is a flicker [1]. Frames
-    are buffered until a track can have as many."""
+    are buffered until a track can have as many: `stride` times `min_hits` - 1 images in memory."""
     pitch_margin_m: float = Field(default=2.5, ge=0, le=1000)
     """People whose feet are farther outside of the pitch than this are crowd (D2) [m]. Throw-ins,
     sprints over the line and assistants, 1.5 m out, stay: the position of a far foot is accurate to
@@ -77,7 +78,8 @@ class DetectionSettings(Record):
     find_occluded: bool = False
     """The embedded pose net also searches boxes shifted to the side of every detected person, where
     a detector sees the person in front alone. This finds more people, and more false boxes that are
-    half of two people; poses take twice as long. Not with `flip_test` or another pose net."""
+    half of two people; poses take twice as long. Not with `flip_test` or another pose net, and not
+    where boxes are given."""
     landmarks: bool = False
     """A second net also finds 64 landmarks of the surface, heels and toes. It takes as long as the
     net of joints, which stay as they are. Off: bodies hardly get better by these points yet
@@ -89,6 +91,11 @@ class DetectionSettings(Record):
     COCO's object keypoint similarity]."""
     max_people: int = Field(default=64, ge=1, le=1024)
     """Most people per frame; those with the best scores stay. Given boxes all stay."""
+
+    @property
+    def longest_gap(self) -> int:
+        """Longest time between two sightings of a track that is filled [frame]."""
+        return max(self.max_gap_frames, self.stride)
 
     @model_validator(mode="after")
     def _refuse_occluded_search_without_bundled_net(self) -> Self:

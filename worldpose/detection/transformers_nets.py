@@ -15,7 +15,7 @@ import numpy as np
 from data_contracts.arrays import Floats, Image
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.interfaces import MIN_SCORE, People
-from worldpose.detection.onnx_detectors import find_person_classes
+from worldpose.detection.onnx_detectors import find_person_classes, select_named_people
 from worldpose.detection.onnx_nets import import_library
 from worldpose.errors import InputError
 
@@ -32,7 +32,7 @@ class TransformersDetector:
             folder: folder with config.json, model.safetensors and preprocessor_config.json.
             device: `cpu` or `cuda`.
             half: compute in half precision, on a GPU only.
-            person_classes: as of `load_onnx_detector`.
+            person_classes: as of `load_onnx_detector`, for a net whose names tell no people.
 
         Raises:
             InputError: transformers or a GPU is missing, the folder holds no such net, or its
@@ -49,7 +49,8 @@ class TransformersDetector:
         # transformers writes LABEL_0, LABEL_1 and so on where a checkpoint has no names.
         names = {k: n for k, n in net.config.id2label.items() if not n.startswith("LABEL_")}
         count = net.config.num_labels
-        self._people = find_person_classes(str(folder), count, names, person_classes)
+        asked = None if select_named_people(names) else person_classes
+        self._people = find_person_classes(str(folder), count, names, asked)
         size = self._processor.size
         self._size = (int(size.get("width", 640)), int(size.get("height", 640)))
 

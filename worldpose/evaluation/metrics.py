@@ -289,13 +289,13 @@ def evaluate_joints(
 
     Raises:
         InputError: camera and reference have different numbers of frames, `fps` is not positive,
-            or no frame of the prediction is one of the reference.
+            or the prediction is before or after the whole reference.
     """
     settings = settings or EvaluationSettings()
     if fps is not None:
         row_rate("evaluate_joints", fps)
     sides = prediction.frames, reference.frames
-    if all(map(len, sides)) and not np.isin(sides[0], sides[1]).any():
+    if all(map(len, sides)) and max(map(np.min, sides)) > min(map(np.max, sides)):
         own, wanted = (f"{frames.min()} to {frames.max()}" for frames in sides)
         raise InputError(
             "frames of the prediction",

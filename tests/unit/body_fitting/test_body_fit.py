@@ -154,9 +154,10 @@ def test_arrays_that_do_not_fit_are_refused():
     joints, bias = np.zeros((1, 1, 17, 3)), np.full(17, 0.03)
     alone = 0.01**2 * np.broadcast_to(np.eye(3), (1, 1, 17, 3, 3))
     whole = alone + np.float32(0.03**2 - 0.01**2) * np.eye(3)  # nothing else, rounded
-    ClipEvidence(joints, (whole - alone).astype(np.float32), 50.0, bias)
+    ClipEvidence(joints, (whole - alone).astype(np.float32), 50.0, bias).require_bias()
+    ClipEvidence(joints, -alone, 50.0, np.zeros(17)).require_bias()  # no bias is to blame
     with pytest.raises(InputError, match=r"common_bias.*covariance of 17 joints"):
-        ClipEvidence(joints, alone, 50.0, bias)
+        fit_bodies(MODEL, ClipEvidence(joints, alone, 50.0, bias), SETTINGS)
 
 
 def test_offsets_are_far_beyond_the_chance_of_all_joints_together():

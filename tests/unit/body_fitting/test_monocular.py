@@ -81,6 +81,7 @@ def test_turns_and_crops_are_the_same_whatever_the_method(tmp_path, layout):
         ({"frame": np.zeros(5)}, "3 frames"),
         ({"frame": np.array([1.0, 2.5, 3.0])}, "whole frame"),
         ({"frame": np.array([1.0, np.nan, 3.0])}, "whole frame"),
+        ({"frame": np.array(["1", "2", "c.jpg"])}, "whole frame"),
         ({"box_center": None, "bbox": np.tile([900.0, 500.0, 1.5], (3, 1))}, "corners"),
         ({"box_center": None, "bbox": np.tile([900.0, 500.0, 120.0, 300.0], (3, 1))}, "corners"),
     ],
@@ -93,9 +94,11 @@ def test_files_that_lack_something_are_refused_with_its_name(tmp_path, change, s
     assert str(path) in str(told.value)
 
 
-def test_boxes_with_scores_at_the_border_or_of_nobody_are_read():
-    boxes = np.array([[0.0, 0.0, 20.0, 40.0, 0.9], [0.0, 8.0, 0.0, 10.0, 0.5], [np.nan] * 5])
-    found = parse_monocular({"poses": VECTORS.reshape(3, 72), "bbox": boxes}, "a.npz")
+def test_boxes_with_scores_and_classes_or_of_nobody_and_frames_as_text_are_read():
+    boxes = np.array([[0.0, 0.0, 20.0, 40.0, 0.9, 0], [0.0, 8.0, 0.0, 10.0, 0.5, 0], [np.nan] * 6])
+    arrays = {"poses": VECTORS.reshape(3, 72), "bbox": boxes, "frame": np.array(["7", "8", "008"])}
+    found = parse_monocular(arrays, "a.npz")
+    assert found.frame.tolist() == [7, 8, 8]
     np.testing.assert_array_equal(found.center, [[10.0, 20.0], [0.0, 9.0], [np.nan, np.nan]])
 
 

@@ -10,7 +10,7 @@ from worldpose.detection.box_tracking import BoxCleaner, BoxTracker, detect_stri
 from worldpose.detection.interfaces import People
 from worldpose.detection.pipeline import PeopleFinder, Place, detect_people, on_pitch
 from worldpose.detection.settings import DetectionSettings
-from worldpose.detection.suppression import suppress
+from worldpose.detection.suppression import combine_boxes, suppress
 from worldpose.detection.turning import QuarterTurn
 from worldpose.detection.views import TiledDetector
 from worldpose.errors import InputError
@@ -168,7 +168,20 @@ def test_given_boxes_beyond_the_limit_stay_and_detected_ones_are_counted():
     finder = PeopleFinder([one], one, DetectionSettings(max_people=60))
     for given, count in (({0: People(boxes, np.ones(70))}, 70), (None, 60)):
         (found,) = finder.find([(0, image)], None, given)
-        assert (np.isfinite(found.score).sum(), finder.report.cut) == (count, 70 - count)
+        assert (np.isfinite(found.score).sum(), finder.report.cut) == (count, int(count < 70))
+
+
+def test_no_one_found_beside_given_people_displaces_them():
+    boxes = 24.0 * np.arange(3)[:, None] + [0.0, 10.0, 20.0, 40.0]
+    one, image = Knowing([boxes], [np.full(3, 0.5)]), np.zeros((96, 96, 3), np.uint8)
+    one.estimate_frames = lambda images, boxes: [one.estimate(images[0], boxes[0])]
+    beyond = People(boxes[:1] + [0.0, 45.0, 0.0, 45.0], np.ones(1))
+    behind = combine_boxes(beyond, one.estimate(image, beyond.boxes))
+    one.find_occluded = lambda images, people: [behind]
+    finder = PeopleFinder([one], one, DetectionSettings(max_people=3, find_occluded=True))
+    for given, beside in (({0: People(boxes, np.full(3, 0.5))}, 0), (None, 1)):
+        list(finder.find([(0, image)], None, given))
+        assert (finder.report.beside, finder.report.cut) == (beside, beside)
 
 
 PICTURE = np.zeros((4, 4, 3), dtype=np.uint8)
@@ -212,7 +225,6 @@ def test_a_gap_is_filled_evenly_and_a_longer_one_is_not():
 
 
 def test_looks_at_every_third_frame_give_boxes_in_all_of_them():
-    batch = 3
     looked = []
 
     def look(pictures):
@@ -221,8 +233,8 @@ def test_looks_at_every_third_frame_give_boxes_in_all_of_them():
         return [people([*walker(number), 0.9]) for number in numbers]
 
     frames = [(n, None if n == 5 else np.full((4, 4, 3), n, dtype=np.uint8)) for n in range(21)]
-    cleaner = BoxCleaner(DetectionSettings(stride=3, max_gap_frames=0))
-    found = list(cleaner.clean(detect_strided(iter(frames), look, 3, batch)))
+    settings = DetectionSettings(stride=3, max_gap_frames=0, batch=3)
+    found = list(BoxCleaner(settings).clean(detect_strided(iter(frames), look, settings)))
     assert looked == [0, 3, 6, 9, 12, 15, 18, 20]  # and the last, so that boxes reach the end
     assert [number for number, _, _ in found] == list(range(21))
     for number, picture, one in found:
@@ -355,6 +367,9 @@ def test_people_of_a_camera_on_its_side_are_found_where_they_are(quarters, is_gi
     [
         ({50}, 0, {"stride": 10}),
         ({50, 51, 52}, 0, {"stride": 10}),
+        ({49, 50}, 0, {"stride": 10}),
+        ({*range(6, 14), *range(17, 21)}, 0, {"stride": 10, "batch": 1}),
+        (set(range(1, 100, 2)), 24, {"stride": 5, "min_hits": 3}),
         (set(), 30, {"stride": 10, "min_hits": 3}),
         (set(), 30, {"min_hits": 12}),
     ],
@@ -366,7 +381,7 @@ def test_no_frame_of_a_true_track_is_lost(lost, begin, settings):
 
     asked = DetectionSettings(**settings)
     frames = ((n, None if n in lost else np.full((4, 4, 3), n, np.uint8)) for n in range(100))
-    found = BoxCleaner(asked).clean(detect_strided(frames, look, asked.stride, asked.batch))
+    found = BoxCleaner(asked).clean(detect_strided(frames, look, asked))
     shown = {number for number, _, one in found if len(one.scores)}
     assert shown == set(range(begin, 100)) - lost
 
@@ -374,7 +389,22 @@ def test_no_frame_of_a_true_track_is_lost(lost, begin, settings):
 def test_frames_in_memory_do_not_grow_with_batch_times_stride():
     taken = []
     frames = (taken.append(n) or (n, PICTURE) for n in range(500))
-    most = 0
-    for n, _, _ in detect_strided(frames, lambda each: [people()] * len(each), 25, 8):
+    most, settings = 0, DetectionSettings(stride=25)
+    for n, _, _ in detect_strided(frames, lambda each: [people()] * len(each), settings):
         most = max(most, len(taken) - n)
     assert most <= 51
+
+
+@pytest.mark.parametrize(
+    ("stride", "every", "least", "searched"), [(5, 1, 7, 81), (5, 2, 6, 68), (2, 1, 8, 201)]
+)
+def test_batches_are_full_and_missing_images_cost_no_further_ones(stride, every, least, searched):
+    calls = []
+
+    def look(pictures):
+        calls.append(len(pictures))
+        return [people()] * len(pictures)
+
+    frames = ((n, None if n % every else PICTURE) for n in range(401))
+    list(detect_strided(frames, look, DetectionSettings(stride=stride)))
+    assert (min(calls[:-1]), sum(calls)) == (least, searched)

@@ -149,12 +149,17 @@ def test_classes_of_people_are_named_numbered_or_asked_for():
         classes({0: "ball", 1: "goal"})
     with pytest.raises(InputError, match="below 4"):
         classes({}, [4])
+    assert classes({0: "ball", 1: "People", 2: "players", 3: "human"}) == (1, 2, 3)
+    for count in (1, None):
+        assert find_person_classes("net.onnx", count, {0: "footballer"}, None) == (0,)
     assert _class_names({"names": "{0: 'ball', 1: 'player'}"}) == {0: "ball", 1: "player"}
     assert _class_names({"names": "['ball']"}) == _class_names({"names": "{'ball': 0}"})
     assert _class_names({"names": "['ball']"}) == {0: "ball"}
     assert (
         _class_names({"names": "{'a': 'b'}"})
         == _class_names({"names": "f()"})
+        == _class_names({"names": "'person'"})
+        == _class_names({"names": "{'person'}"})
         == _class_names({})
         == {}
     )

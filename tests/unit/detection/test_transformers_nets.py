@@ -120,7 +120,8 @@ def test_classes_of_people_follow_the_rule_of_onnx_detectors(tmp_path):
     football = ("ball", "goalkeeper", "player", "referee")
     for names, asked, expected in (
         (football, None, (1, 2, 3)),
-        (football, [2], (2,)),
+        (football, [0], (1, 2, 3)),  # asked of another net of an ensemble
+        (unnamed, [2], (2,)),
         (unnamed, None, (0,)),
         (unnamed[:4], None, None),
     ):

@@ -107,8 +107,12 @@ def test_frames_are_paired_by_number():
     assert (beyond.frames, beyond.coverage, beyond.false_persons_per_frame) == (4, 1.0, 0.0)
 
 
-def test_frames_that_never_meet_are_refused():
+def test_frames_of_another_clip_are_refused_and_those_between_sparse_labels_score_nothing():
     truth = crowd()
+    sparse = JointTracks(30 * truth.frames, truth.person_ids, truth.joints)
+    between = JointTracks(31 + truth.frames, truth.person_ids, truth.joints)
+    scores = score(between, sparse)
+    assert (scores.coverage, scores.idf1, scores.mpjpe_mm, scores.frames) == (0.0, 0.0, None, 4)
     later = JointTracks(truth.frames + 1000, truth.person_ids, truth.joints)
     with pytest.raises(InputError, match="which has some of 0 to 3, found 1000 to 1003, none in"):
         score(later, truth)
