@@ -28,9 +28,9 @@ HEALTH_MEASURES = (
     "sharpness",
 )
 """Health of a camera: robust loss of its keypoints about the people whom all cameras place, 1 as
-expected; shift of its view and clock offset as these people show them, whom the camera itself
-displaces; share of its detections that no person has, of its frames without an image; brightness
-and contrast of edges [0 to 255]."""
+expected; shift of its view and clock offset as the people whom the others place show them; share
+of its detections that no person has, of its frames without an image; brightness and contrast of
+edges [0 to 255]."""
 
 
 CLOCK_CHANGE = "clock_change_frames."

@@ -53,7 +53,6 @@ from worldpose.triangulation.camera_changes import (
     refine_change,
 )
 from worldpose.triangulation.lost_views import find_lost_views
-from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.world import People, doubt_world
 
 BLOCK: Final = 256
@@ -228,14 +227,13 @@ def _follow_changes(
         if changes:
             people = clip.detections.assign_people(tracks.detection_index)
             camera = clip.camera_ids.index(changes[-1].camera)
-            given = clip.cameras, people, clip.fps, TriangulationSettings()
-            changes[-1] = refine_change(*given, camera, changes[-1])
+            changes[-1] = refine_change(clip.cameras, people, clip.fps, camera, changes[-1])
             if is_by_chance(changes[-1]):
                 clip = open_clip(inputs, further=changes[:-1])
                 return clip, track(clip), tuple(changes[:-1])
             clip = open_clip(inputs, further=changes)
         lost = find_lost_views(clip.cameras, clip.detections, tracks.joints, clip.fps)
-        found = [change_record(each, clip.camera_ids[each.found.camera], frame) for each in lost]
+        found = [change_record(each, clip.camera_ids[each.camera], frame) for each in lost]
         views = [
             each
             for each in found

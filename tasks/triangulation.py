@@ -27,19 +27,18 @@ from tasks.clip_inputs import (
     triangulation_settings,
 )
 from tasks.unit import UnitInputs, figures_of, unit_task
-from worldpose.camera_consistency.changes import Change, Kind, find_changes
 from worldpose.camera_consistency.health import CameraHealth, judge_health, measure_health
 from worldpose.ingest.footage import stretches
 from worldpose.store.writer import ResultWriter
 from worldpose.triangulation.camera_changes import (
+    MeasuredChange,
     change_record,
     describe_change,
-    explain_changes,
+    find_changes,
     is_by_chance,
     is_same_change,
-    join_changes,
-    measure_departures,
 )
+from worldpose.triangulation.change_sums import ChangeSums, Kind, choose_bins, sum_joints
 from worldpose.triangulation.estimate import learn_clip, reconstruct_chunks
 from worldpose.triangulation.person_offsets import stated_errors
 from worldpose.triangulation.results import DetectorModel, Smoothing, Triangulation
@@ -83,10 +82,14 @@ def _write_joints(
     detections, covariance = clip.detections, camera_errors(inputs, clip)
     index = detections.detection_index
     model = learn_clip(clip.cameras, detections, clip.fps, settings, covariance)
-    agreements, changes = [], []
+    agreements, changes, sums = [], [], []
     rows = np.arange(0, len(index), stride)
     _, cameras, persons = index.shape
-    health = CameraHealth.empty(len(rows), cameras, persons, clip.fps / stride)
+    fps = clip.fps / stride
+    health, bins = (
+        CameraHealth.empty(len(rows), cameras, persons, fps),
+        choose_bins(len(rows) * cameras * persons, fps),
+    )
     stated = None
     if covariance is not None:
 
@@ -102,10 +105,12 @@ def _write_joints(
             seen = detections[rows[part.frames]]
             joints = part.triangulation.joints
             health.add(clip.cameras, seen, joints, part.frames.start, stated)
+            sums.append(sum_joints(clip.cameras, seen, joints, part.frames.start, fps, bins))
             agreements.append(part.triangulation.agreement)
             changes.append(part.smoothing.changes)
-        measured = _health_arrays(inputs, clip, health, rows, result)
-        found = _find_changes(inputs, clip, health, kinds, settings, rows, result)
+        equations = ChangeSums.join(sums, clip.cameras, fps)
+        measured = _health_arrays(inputs, clip, health, equations, rows, result)
+        found = _find_changes(inputs, clip, health, equations, kinds, rows, result)
         result.write(
             layout,
             arrays=spool.arrays()
@@ -149,6 +154,7 @@ def _health_arrays(
     inputs: UnitInputs,
     clip: ClipInputs,
     health: CameraHealth,
+    equations: ChangeSums,
     rows: NDArray[np.int64],
     result: ResultWriter,
 ) -> dict[str, NDArray[Any]]:
@@ -169,7 +175,8 @@ def _health_arrays(
     # A camera may film other clips alone.
     has_images = has_images & ~np.isnan(measures["brightness"]).all(axis=0)
     measures["missing"] = np.where(has_images, np.isnan(measures["brightness"]), np.nan)
-    values = measure_health(health, measures)
+    departures = equations.departures(clip.cameras, len(health.sums), health.length)
+    values = measure_health(health, departures, measures)
     if len(rows) < len(frame):
         values[..., HEALTH_MEASURES.index("clock_frames")] = np.nan  # people move too far
     begun = np.asarray(frame[rows][:: health.length], dtype=np.int64)
@@ -196,72 +203,44 @@ def _find_changes(
     inputs: UnitInputs,
     clip: ClipInputs,
     health: CameraHealth,
+    sums: ChangeSums,
     kinds: tuple[Kind, ...],
-    settings: TriangulationSettings,
     rows: NDArray[np.int64],
     result: ResultWriter,
 ) -> list[CameraChange]:
-    """Return the changes of cameras, the known ones and further ones; warn of these.
-
-    One is found at a time, with those before it taken back, or their cameras left out.
-    """
-    fps, names = clip.fps * len(rows) / max(1, len(clip.detections.frame)), clip.camera_ids
-    known, new, warnings = known_changes(inputs, inputs.unit), list[CameraChange](), result.warnings
-    spoilt = set[str]()
-    for _ in range(3 * len(names)):
-        found = [
-            replace(each, row=int(rows[each.row])) for each in find_changes(health, fps, kinds)
-        ]
-        if found and len(names) < 3:
-            warnings.append(_describe_pair(names, found[0], clip.detections.frame))
-            break
-        measured = found and explain_changes(
-            clip.cameras, clip.detections, clip.fps, settings, found, kinds
-        )
-        if not measured:
-            no_knock = all(map(is_by_chance, new))
-            if measured is None and no_knock and np.median(health.misfit) > 3.0:
-                warnings.append(
-                    "no person agrees with the views: all cameras move within the clip, each in "
-                    "its own way, as electronic stabilisation does, or the 2D poses or the "
-                    "calibration are wrong. Give videos without stabilisation, or better 2D poses."
-                )
-            break
-        camera = names[measured.found.camera]
-        change = change_record(measured, camera, clip.detections.frame)
-        if is_by_chance(change):  # told, not taken back: the other cameras are searched without it
+    """Return the changes of cameras, the known ones and further ones; warn of these."""
+    names, frame, warnings = clip.camera_ids, clip.detections.frame, result.warnings
+    known = known_changes(inputs, inputs.unit)
+    found = find_changes(clip.cameras, clip.detections, sums.fps, rows, sums, kinds)
+    if found and len(names) < 3:
+        warnings.append(_describe_pair(names, found[0], frame[rows]))
+        return known
+    new = list[CameraChange]()
+    for measured in found:
+        row = None if measured.row is None else int(rows[measured.row])
+        change = change_record(replace(measured, row=row), names[measured.camera], frame)
+        if is_by_chance(change):  # told, not taken back
             change = change.model_copy(update={"is_explained": False})
-        same = [n for n, other in enumerate(new) if is_same_change(other, change, clip.fps)]
-        if camera in spoilt or any(is_same_change(one, change, clip.fps) for one in known):
-            break
-        if same:  # what other changes had hidden of it
-            frame = new[same[0]].frame
-            new[same[0]] = join_changes(new[same[0]], change).model_copy(update={"frame": frame})
-        else:
+        if not any(is_same_change(one, change, clip.fps) for one in known):
             new.append(change)
-        spoilt = {each.camera for each in new if each.kind == "clock" or not each.is_explained}
-        aside = [
-            each.model_copy(update={"is_left_out": True, "kind": "view"})
-            if each.camera in spoilt
-            else each
-            for each in new
-        ]
-        if len(names) - len(spoilt) < 3:
-            break
-        clip = open_tracked_clip(inputs, further=aside)
-        health = measure_departures(clip.cameras, clip.detections, fps, settings, rows)
+    if not new and np.median(health.misfit) > 3.0:
+        warnings.append(
+            "no person agrees with the views: all cameras move within the clip, each in "
+            "its own way, as electronic stabilisation does, or the 2D poses or the "
+            "calibration are wrong. Give videos without stabilisation, or better 2D poses."
+        )
     warnings += [f"{describe_change(change)}." for change in new]
     clocks = [change for change in new if change.kind == "clock"]
     result.figures |= {CLOCK_CHANGE + each.camera: each.late_frames for each in clocks}
+    spoilt = sorted({each.camera for each in new if each.kind == "clock" or not each.is_explained})
     if len(names) - len(spoilt) < 3 < len(names):
-        those = ", ".join(sorted(spoilt))
-        warnings.append(f"changes of other cameras can hide behind those of {those}.")
+        warnings.append(f"changes of other cameras can hide behind those of {', '.join(spoilt)}.")
     return [*known, *new]
 
 
-def _describe_pair(names: Sequence[str], found: Change, frame: NDArray[np.integer]) -> str:
+def _describe_pair(names: Sequence[str], found: MeasuredChange, frame: NDArray[np.integer]) -> str:
     """Return a sentence about a change of two cameras, which cannot tell whose it is."""
-    when = f"at frame {frame[found.row]}" if found.is_sudden else "slowly"
+    when = "slowly" if found.row is None else f"at frame {frame[found.row]}"
     return (
         f"cameras {' and '.join(names)} cease to agree {when}: one of them moved, or its clock "
         "changed. Two cameras cannot tell which."

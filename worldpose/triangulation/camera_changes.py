@@ -1,15 +1,15 @@
 """Cameras that change within a clip, and how much: clocks that step or drift, views that move.
 
-`camera_consistency.changes` finds a change from joints that the changed camera has displaced. Here
-the change is corrected in the detections, people are triangulated again, and the rest is added,
-until there is none.
+The parts of all cameras are fitted together (`change_parts`), taken back in the detections, and
+fitted again, until they stay.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,15 +18,34 @@ from scipy.spatial.transform import Rotation
 from data_contracts.arrays import AnyFloats, ClipArray, Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import CameraChange
-from worldpose.camera_consistency.changes import Change, Kind, find_changes, measure_step
-from worldpose.camera_consistency.health import LIMBS, UNKNOWNS, CameraHealth
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
-from worldpose.triangulation.clocks import read_frames
-from worldpose.triangulation.noise_model import NoiseModel
-from worldpose.triangulation.residuals import Observations, Rig
+from worldpose.triangulation.change_parts import (
+    Part,
+    expected_step,
+    find_sway,
+    fit_parts,
+    fit_sizes,
+    is_settled,
+    on_common_clock,
+    spreads,
+)
+from worldpose.triangulation.change_sums import (
+    LOOSE,
+    WIDTH,
+    ChangeSums,
+    Kind,
+    choose_bins,
+    choose_rows,
+    half_window,
+    sum_joints,
+)
+from worldpose.triangulation.clocks import (
+    shift_in_time,
+    triangulate_views,
+)
+from worldpose.triangulation.residuals import Rig
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.solve import solve_joints
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,111 +53,205 @@ class MeasuredChange:
     """A change of a camera with its size.
 
     Attributes:
-        found: camera, kind and moment.
+        camera: index.
+        kind: its clock or its view changed.
+        row: row of the first frame after a sudden change; None = over the whole clip.
         amount: (5,) shift along x and y [px], zoom [1], roll [rad] and clock offset [frame] of the
             images after a sudden change, or at the end of the clip.
         std: standard deviation of its size [frame] or [px].
+        gain: how many detections it explains, or decrease of the sum of squares [1].
         is_explained: whether all cameras agree with the change corrected.
         is_left_out: whether its views are useless if the change does not explain them.
-        before: offset of a changed clock before the change [frame].
     """
 
-    found: Change
+    camera: int
+    kind: Kind
+    row: int | None
     amount: Floats
-    std: float
+    std: float = np.inf
+    gain: float = 0.0
     is_explained: bool = True
     is_left_out: bool = False
-    before: float = 0.0
-
-    def at(self, rows: Floats, frames: int) -> Floats:
-        """Return the share (n,) of the change at rows of a clip of some frames."""
-        if self.found.is_sudden:
-            return np.asarray((rows >= self.found.row) * 1.0)
-        return np.asarray(rows / max(1.0, frames - 1.0))
 
 
-def explain_changes(
+def find_changes(
     cameras: Camera,
     people: KeypointDetections[ClipArray],
     fps: float,
-    settings: TriangulationSettings,
-    found: Sequence[Change],
+    rows: Integers,
+    sums: ChangeSums,
     kinds: Sequence[Kind] = ("clock", "view"),
-) -> MeasuredChange | None:
-    """Return the change of the camera without which the others agree; None if there is none.
+) -> list[MeasuredChange]:
+    """Return the changes of all cameras within a clip.
 
     Args:
-        cameras: batch (cameras,), at least three.
+        cameras: batch (cameras,).
         people: detections of the tracked people of a clip.
-        fps: frames per second [1/s].
-        settings: noise of the keypoints.
-        found: changes as `find_changes` finds them, at least one.
-        kinds: what may change. Where people are spoilt, a clock can look like a view.
+        fps: rows per second [1/s].
+        rows: the rows of the clip that `sums` count.
+        sums: equations of the people as triangulated.
+        kinds: what may change.
     """
-    loose = settings.model_copy(update={"max_deviation": 30.0})
-    trial = _Trial(cameras, people, fps, loose)
-    change = _leave_one_out(trial, found, kinds)
-    if change is not None and change.is_explained:
-        return change
-    # In a crowd, or where little changes, leaving out a camera tells less than a clear change.
-    if found[0].gain < 300.0:
-        return change
-    windows, direct = trial.choose_windows(found[0]), trial.measure(found[0])
-    before, after = trial.misfit(windows), trial.misfit(windows, direct)
-    possible = before - trial.misfit(windows, without=found[0].camera)
-    return direct if before - after > max(0.02 * before, 0.7 * possible) else change
+    frames, free = len(rows), None
+    parts, after = _fit_clip(cameras, people, fps, rows, sums, kinds)
+    swaying = find_sway(sums, after, parts) if "view" in kinds else None
+    if swaying is not None:
+        free, is_left_out = swaying
+        parts, after = _fit_clip(cameras, people, fps, rows, sums, kinds, free)
+    shifting = [part for part in parts if part.shape != "constant"]
+    found = [
+        _measure(part, std, cameras[part.camera], frames)
+        for part, std in zip(shifting, spreads(after, shifting, frames), strict=True)
+    ]
+    if free is not None:
+        unknown = MeasuredChange(free, "view", None, np.zeros(WIDTH), is_explained=False)
+        found.append(replace(unknown, is_left_out=is_left_out))
+    return found
 
 
-def _leave_one_out(
-    trial: _Trial, found: Sequence[Change], kinds: Sequence[Kind]
-) -> MeasuredChange | None:
-    """Return the change of the camera without which the others agree; None if there is none."""
-    people, windows = trial.people, trial.choose_windows(found[0])
-    before = trial.misfit(windows)
-    # In a small rig a camera that sways spoils the others so that theirs are the changes found.
-    count = len(trial.cameras.focal)
-    suspects = range(count) if count <= 8 else {each.camera for each in found}
-    without = {c: trial.misfit(windows, without=c) for c in suspects}
-    culprit = min(without, key=lambda c: without[c])
-    # One camera of many hardly counts in the mean.
-    if before - without[culprit] < 0.25 * before / (count - 1):
-        return None
-    # Its change without its own share in the people, which hides a part.
-    near = [each for each in found if each.camera == culprit] or list(found)
-    alone, misfit = trial.find_alone(culprit, near[0], kinds)
-    # Five real cameras that stand still have 0.9 to 1.7 times the misfit of the others.
-    if misfit < 2.0 * without[culprit]:
-        return None
-    own = [trial.measure(each) for each in alone or near if each.camera == culprit]
-    is_left_out = misfit > 8.0 * without[culprit]
-    if not own:
-        swaying = replace(near[0], camera=culprit, is_sudden=False)
-        unknown = MeasuredChange(swaying, np.zeros(UNKNOWNS), np.inf)
-        return replace(unknown, is_explained=False, is_left_out=is_left_out)
-    after = [trial.misfit(windows, each) for each in own]
-    best = int(np.argmin(after))
-    # A camera that sways is not explained by one change.
-    is_explained = before - after[best] > 0.7 * (before - without[culprit])
+def _fit_clip(
+    cameras: Camera,
+    people: KeypointDetections[ClipArray],
+    fps: float,
+    rows: Integers,
+    sums: ChangeSums,
+    kinds: Sequence[Kind],
+    free: int | None = None,
+) -> tuple[list[Part], ChangeSums]:
+    """Return parts as of `find_changes`, and sums with them taken back.
+
+    The views of a `free` camera count for nothing.
+    """
+    parts = [Part(c, "constant", 0, (0.0,)) for c in range(sums.cameras)]
+    tried = [[part.name for part in parts]]
+    for _ in range(12):
+        sums = sums if free is None else sums.without_camera(free)
+        add_up = partial(sum_clip, cameras, people, fps, rows)
+        placed = place_steps(parts, len(rows), fps, partial(add_up, parts))
+        fitted = on_common_clock(fit_parts(sums, placed, len(rows), kinds))
+        names = [part.name for part in fitted]
+        # What comes and goes is hardly clear.
+        returns = names != tried[-1] and names in tried
+        is_done = returns or is_settled(parts, fitted)
+        parts = [part for part in fitted if not returns or part.name in tried[-1]]
+        tried.append(names)
+        if is_done:
+            break
+        sums = add_up(parts)
+    return parts, sums
+
+
+def _measure(part: Part, std: Floats, camera: Camera, frames: int) -> MeasuredChange:
+    """Return a part as a change."""
+    row = part.row if part.shape == "step" else None
+    amount, size = view_amount(part, camera), float(np.linalg.norm(std[:2]))
     # No recorder's clock runs 2 % fast: such a drift is steps that people hardly show.
-    most = 0.02 * len(people.detection_index)
-    is_explained &= own[best].found.is_sudden or abs(own[best].amount[4]) < most
-    if not is_explained:
-        # One of several knocks explains the seconds around it.
-        around = replace(trial, seconds=2)
-        steps = [each.found for each in own if each.found.is_sudden and each.found.kind == "view"]
-        for step in map(around.measure, steps):
-            windows = around.choose_windows(step.found)
-            before, rest = around.misfit(windows), around.misfit(windows, without=culprit)
-            if before - around.misfit(windows, step) > max(0.7 * (before - rest), 0.2 * before):
-                return step
-    return replace(own[best], is_explained=bool(is_explained), is_left_out=is_left_out)
+    is_usual = row is not None or abs(amount[4]) < 0.02 * frames
+    std_px = size if part.kind == "clock" else size * float(camera.focal.mean())
+    return MeasuredChange(part.camera, part.kind, row, amount, std_px, is_explained=is_usual)
+
+
+def view_amount(part: Part, camera: Camera) -> Floats:
+    """Return a size as the amount (5,) of a `MeasuredChange`."""
+    amount = np.zeros(WIDTH)
+    if part.kind == "clock":
+        amount[4] = part.size[0]
+    else:
+        x, y, roll, growth = part.size
+        fx, fy = camera.focal
+        amount[:4] = fx * y, -fy * x, math.expm1(growth), roll
+    return amount
+
+
+def sum_clip(
+    cameras: Camera,
+    people: KeypointDetections[ClipArray],
+    fps: float,
+    rows: Integers,
+    parts: Sequence[Part] = (),
+    settings: TriangulationSettings = LOOSE,
+    near: slice = slice(None),
+    bins: tuple[int, int] | None = None,
+) -> ChangeSums:
+    """Return the equations of people who are triangulated with parts taken back.
+
+    Args:
+        cameras: batch (cameras,).
+        people: detections of the tracked people of a clip.
+        fps: rows per second [1/s].
+        rows: rows of the clip.
+        parts: parts that are corrected in the detections.
+        settings: accepted deviations.
+        near: the rows that count.
+        bins: as of `choose_bins`; None = its own choice.
+    """
+    frames, half = len(rows), half_window(fps)
+    length, every = bins or choose_bins(frames * people.detection_index[0].size, fps)
+    rig, late = Rig.from_cameras(cameras), np.zeros((len(cameras.focal), frames))
+    for part in parts:
+        if part.kind == "clock":
+            late[part.camera] += part.size[0] * part.share(np.arange(frames), frames)
+    reach = math.ceil(np.abs(late).max(initial=0.0)) + half
+    first, last, _ = near.indices(frames)
+    sums, step = [], length * max(1, 256 // length)
+    for start in range(first - first % length, last, step):
+        begun, end = max(0, start - reach), min(frames, start + step + reach, last + reach)
+        seen = _take_back(people[rows[begun:end]], cameras, parts, begun, frames)
+        seen = shift_in_time(seen, late[:, begun:end])
+        # Those beyond the chunk have no neighbours in time, or belong to the next.
+        inner = slice(max(0, start - half) - begun, min(end, start + step + half) - begun)
+        seen, begun = seen[inner], begun + inner.start
+        at = choose_rows(len(seen.detection_index), begun, fps, every)
+        if not len(at):
+            continue
+        used = np.unique(at[:, None] + np.array([-half, 0, half]))
+        joints = np.full((len(seen.detection_index), seen.detection_index.shape[2], 17, 3), np.nan)
+        joints[used] = triangulate_views(rig, seen[used], settings)
+        sums.append(sum_joints(cameras, seen, joints, begun, fps, (length, every), settings))
+    return ChangeSums.join(sums, cameras, fps)
+
+
+def place_steps(
+    parts: Sequence[Part], frames: int, fps: float, add_up: Callable[..., ChangeSums]
+) -> list[Part]:
+    """Return parts with each step at the row that the rows around it show.
+
+    Along the step's size d, the residuals of a row t have the amplitude a_t with weight h_t: 0
+    before the step and 1 from it on, with a constant m. Among rows k, the expected one by
+    exp(-sum_t h_t (a_t - [t >= k] - m)^2 / (2 noise)) is chosen. `add_up` is `sum_clip` for people
+    with the parts taken back.
+    """
+    near, placed = round(1.0 * fps), list(parts)
+    for number, part in enumerate(parts):
+        if part.shape != "step":
+            continue
+        around = slice(max(0, part.row - near), part.row + near)
+        sums = add_up(near=around, bins=(1, 1))
+        placed[number] = replace(part, row=expected_step(sums, part, frames))
+    return placed
+
+
+def _take_back(
+    people: KeypointDetections, cameras: Camera, parts: Sequence[Part], start: int, frames: int
+) -> KeypointDetections:
+    """Return some rows of a clip, from a first one on, with parts of views taken back."""
+    views = [part for part in parts if part.kind == "view"]
+    if not views:
+        return people
+    keypoints = np.array(people.keypoints, dtype=np.float64)
+    rows = np.arange(start, start + len(keypoints))
+    for part in views:
+        c, share = part.camera, part.share(rows, frames)
+        for each in np.unique(share[share > 0.0]):
+            amount = each * view_amount(part, cameras[c])
+            keypoints[share == each, c] = move_back(keypoints[share == each, c], cameras[c], amount)
+    return replace(people, keypoints=keypoints)
 
 
 def refine_change(
     cameras: Camera,
     people: KeypointDetections[ClipArray],
     fps: float,
-    settings: TriangulationSettings,
     camera: int,
     known: CameraChange,
 ) -> CameraChange:
@@ -148,167 +261,21 @@ def refine_change(
         cameras: batch (cameras,), at least three.
         people: detections of the tracked people of a clip, with the known change taken back.
         fps: frames per second [1/s].
-        settings: noise of the keypoints.
         camera: index of the camera.
         known: its change.
     """
     row = int(np.searchsorted(people.frame, known.frame or 0))
-    found = Change(camera, "view", True, row, 0.0, 0.0)
-    measured = _Trial(cameras, people, fps, settings).measure(found)
     frame = np.asarray(people.frame, dtype=np.int64)
+    parts = [Part(c, "constant", 0, (0.0,)) for c in range(len(cameras.focal))]
+    parts.append(Part(camera, "step", row, (0.0,) * 4))
+    near = slice(max(0, row - round(6.0 * fps)), row + round(6.0 * fps))
+    for _ in range(4):
+        taken = parts[-1:]
+        sums = sum_clip(cameras, people, fps, np.arange(len(frame)), taken, near=near)
+        parts = [*parts[:-1], *fit_sizes(sums, [*parts[:-1], *taken], len(frame))[-1:]]
+    std = spreads(sums, parts[-1:], len(frame))[0]
+    measured = _measure(parts[-1], std, cameras[camera], len(frame))
     return join_changes(known, change_record(measured, known.camera, frame))
-
-
-@dataclass(frozen=True, eq=False)
-class _Trial:
-    """Windows of a clip, triangulated with a change corrected or without a camera."""
-
-    cameras: Camera
-    people: KeypointDetections[ClipArray]
-    fps: float
-    settings: TriangulationSettings
-    seconds: int = 6
-
-    def choose_windows(self, found: Change) -> list[slice]:
-        """Return intervals of a second that a change leaves whole, some on both sides of it."""
-        frames, length = len(self.people.detection_index), max(3, round(self.fps))
-        # Half as many seconds of a large rig show as much, and take as long.
-        share = 1 if length * self.people.detection_index[0].size < 10_000 else 2
-        if not found.is_sudden:
-            starts = range(0, max(1, frames - length + 1), length)
-            chosen = np.unique(np.linspace(0, len(starts) - 1, 16 // share).astype(int))
-            return [slice(starts[k], starts[k] + length) for k in chosen]
-        # Not at the step: its place is known to some frames, and a clock's correction reads there.
-        gap = length // 2
-        ends = range(length, found.row - gap + 1, length)
-        before = [slice(end - length, end) for end in ends]
-        starts = range(found.row + gap, frames - length + 1, length)
-        after = [slice(start, start + length) for start in starts]
-        # Near an end of the clip, a part of a second has to do.
-        if not before:
-            before = [slice(0, max(3, found.row - gap // 2))]
-        if not after:
-            after = [slice(min(frames - 3, found.row + gap // 2), frames)]
-        most = self.seconds // share
-        return [*before[-most:], *after[:most]]
-
-    def find_alone(
-        self, camera: int, near: Change, kinds: Sequence[Kind]
-    ) -> tuple[list[Change], float]:
-        """Return a camera's changes and misfit [1] towards the people whom the others place."""
-        frames = len(self.people.detection_index)
-        first = 0 if frames <= 6000 else max(0, min(near.row, frames - 3000) - 1500)
-        span = range(first, frames if frames <= 6000 else first + 3000)
-        health = measure_departures(
-            self.cameras, self.people, self.fps, self.settings, np.array(span), camera
-        )
-        changes = [
-            replace(each, row=each.row + first)
-            for each in find_changes(health, self.fps, kinds)
-            if each.camera == camera
-        ]
-        return changes, float(health.misfit[camera])
-
-    def measure(self, found: Change) -> MeasuredChange:
-        """Return a change with its size."""
-        measured = MeasuredChange(found, np.zeros(UNKNOWNS), np.inf)
-        frames = len(self.people.detection_index)
-        windows = self.choose_windows(found)
-        middles = np.array([0.5 * (window.start + window.stop - 1) for window in windows])
-        for _ in range(20):
-            each = [self._look(window, measured)[0] for window in windows]
-            sums = CameraHealth.empty(len(each), len(self.cameras.focal), 1, 5.0)
-            for number, one in enumerate(each):
-                sums.matrix[number] = one.matrix.sum(axis=0)
-                sums.right[number] = one.right.sum(axis=0)
-            change, std, rest = measure_step(sums, found, measured.at(middles, frames))
-            amount, before = measured.amount + change, measured.before + rest
-            measured = replace(measured, amount=amount, std=std, before=before)
-            if max(np.abs(change).max(), abs(rest)) < 0.01:
-                break
-        return measured
-
-    def misfit(
-        self,
-        windows: Sequence[slice],
-        change: MeasuredChange | None = None,
-        without: int | None = None,
-    ) -> float:
-        """Return the mean loss of the departures of all cameras, per degree of freedom [1]."""
-        cost = freedom = 0.0
-        for window in windows:
-            one, joints = self._look(window, change, without)
-            _, terms, loss = one.sums.sum(axis=(0, 1))
-            cost += float(loss)
-            freedom += 2.0 * float(terms) - 3.0 * joints
-        return cost / max(1.0, freedom)
-
-    def _look(
-        self, window: slice, change: MeasuredChange | None, without: int | None = None
-    ) -> tuple[CameraHealth, int]:
-        """Return the departures in a window, and the number of joints."""
-        cameras, seen = self.cameras, self.people[window]
-        if change is not None:
-            seen = correct_window(cameras, self.people, window, change)
-        seen = _without(seen, without)
-        joints = triangulate_views(cameras, seen, self.settings)
-        one = CameraHealth.empty(len(joints), len(cameras.focal), joints.shape[1], self.fps)
-        one.add(cameras, seen, joints, 0)
-        return one, int(np.isfinite(joints[1:-1, :, LIMBS, 0]).sum())
-
-
-def _without(seen: KeypointDetections, camera: int | None) -> KeypointDetections:
-    """Return the people without the views of a camera."""
-    if camera is None:
-        return seen
-    index = seen.detection_index.copy()
-    index[:, camera] = -1
-    return seen.assign_people(index)
-
-
-def triangulate_views(
-    cameras: Camera, seen: KeypointDetections, settings: TriangulationSettings
-) -> Floats:
-    """Return joints (frames, persons, 17, 3) [m] by the stated noise."""
-    precision = NoiseModel.nominal(seen.confidence.shape[-1]).precision(seen.confidence)
-    rig, index = Rig.from_cameras(cameras), seen.detection_index
-    return solve_joints(Observations.of(rig, seen.keypoints, precision, index), settings).joints
-
-
-def measure_departures(
-    cameras: Camera,
-    people: KeypointDetections[ClipArray],
-    fps: float,
-    settings: TriangulationSettings,
-    rows: Integers,
-    without: int | None = None,
-) -> CameraHealth:
-    """Return the departures of cameras in some rows of a clip, `fps` of them per second.
-
-    The people are placed by the stated noise, and `without` the views of a camera.
-    """
-    _, count, persons = people.detection_index.shape
-    health, length = CameraHealth.empty(len(rows), count, persons, fps), 512
-    for start in range(0, len(rows), length):
-        part = slice(max(0, start - 1), start + length + 1)
-        seen = people[rows[part]]
-        joints = triangulate_views(cameras, _without(seen, without), settings)
-        health.add(cameras, seen, joints, part.start)
-    return health
-
-
-def correct_window(
-    cameras: Camera, people: KeypointDetections[ClipArray], window: slice, change: MeasuredChange
-) -> KeypointDetections:
-    """Return the people of some frames with a change corrected."""
-    middle = 0.5 * (window.start + window.stop - 1)
-    amount = change.amount * change.at(np.array([middle]), len(people.detection_index))
-    c, late = change.found.camera, np.zeros(len(cameras.focal))
-    late[c] = change.before + amount[4]
-    seen = read_frames(people, window, late) if late[c] else people[window]
-    keypoints = np.array(seen.keypoints, dtype=np.float64)
-    keypoints[:, c] = move_back(keypoints[:, c], cameras[c], amount)
-    return replace(seen, keypoints=keypoints)
 
 
 def move_back(pixels: Floats, camera: Camera, amount: Floats) -> Floats:
@@ -452,11 +419,10 @@ def describe_change(change: CameraChange) -> str:
 def change_record(change: MeasuredChange, camera: str, frame: Integers) -> CameraChange:
     """Return a change as results store it; match frames (n,) of a clip."""
     x, y, zoom, roll, late = change.amount.tolist()
-    found = change.found
     return CameraChange(
         camera=camera,
-        kind=found.kind,
-        frame=int(frame[found.row]) if found.is_sudden else None,
+        kind=change.kind,
+        frame=None if change.row is None else int(frame[change.row]),
         first_frame=int(frame[0]),
         frame_count=len(frame),
         shift_px=(x, y),
@@ -465,5 +431,5 @@ def change_record(change: MeasuredChange, camera: str, frame: Integers) -> Camer
         late_frames=late,
         std=change.std if np.isfinite(change.std) else None,
         is_explained=change.is_explained,
-        is_left_out=not change.is_explained and change.is_left_out and found.kind == "view",
+        is_left_out=not change.is_explained and change.is_left_out and change.kind == "view",
     )

@@ -209,19 +209,35 @@ class MovingJoints:
         cls, rig: Rig, people: KeypointDetections, fps: float, settings: TriangulationSettings
     ) -> MovingJoints:
         """Return the joints with a velocity, of detections by person on the common clock."""
-        pixels, index = people.keypoints, people.detection_index
-        precision = NoiseModel.nominal(pixels.shape[-2]).precision(people.confidence)
-        observations = Observations.of(rig, pixels, precision, index)
-        joints = solve_joints(observations, settings).joints
+        joints = triangulate_views(rig, people, settings)
         # Half the time over which velocity is computed is 0.06 s.
         half = max(1, round(0.06 * fps))
-        velocity = (joints[2 * half :] - joints[: -2 * half]) / (2.0 * half)
-        here = slice(half, len(joints) - half)
-        at = joints[here]
+        rows = np.arange(half, len(joints) - half)
+        return cls.at_rows(rig, people[rows], joints, rows, half, settings)
+
+    @classmethod
+    def at_rows(
+        cls,
+        rig: Rig,
+        people: KeypointDetections,
+        joints: Floats,
+        rows: Integers,
+        half: int,
+        settings: TriangulationSettings,
+    ) -> MovingJoints:
+        """Return the joints at some rows, of detections by person at these; `half` as for `find`.
+
+        Joints are (frames, persons, joints, 3), and there are `half` more before and after rows.
+        """
+        pixels = people.keypoints
+        precision = NoiseModel.nominal(pixels.shape[-2]).precision(people.confidence)
+        at = joints[rows]
+        velocity = (joints[rows + half] - joints[rows - half]) / (2.0 * half)
         known = np.asarray(np.isfinite(at + velocity).all(axis=-1))
-        seen = pixels[here], precision[here]
         frame, person, _ = np.nonzero(known)
-        return cls(at[known], velocity[known], person, frame + half, known, *seen, rig, settings)
+        return cls(
+            at[known], velocity[known], person, rows[frame], known, pixels, precision, rig, settings
+        )
 
     def look(self, camera: int) -> tuple[Floats, Floats, Floats, Floats]:
         """Return what a camera sees, all 0 where it does not see the joint.
@@ -248,6 +264,15 @@ class MovingJoints:
             np.where(usable, weight, 0.0),
             np.where(usable, size, 0.0),
         )
+
+
+def triangulate_views(
+    rig: Rig, seen: KeypointDetections, settings: TriangulationSettings
+) -> Floats:
+    """Return joints (frames, persons, 17, 3) [m] by the stated noise."""
+    precision = NoiseModel.nominal(seen.confidence.shape[-1]).precision(seen.confidence)
+    observations = Observations.of(rig, seen.keypoints, precision, seen.detection_index)
+    return solve_joints(observations, settings).joints
 
 
 def sum_equations(moving: MovingJoints, *, with_cameras: bool = False) -> PersonSums:
@@ -334,7 +359,7 @@ def shift_in_time(detections: KeypointDetections, late: Floats) -> KeypointDetec
 
     Args:
         detections: detections before any correction.
-        late: (cameras,) [frame]; NaN or 0 leaves a camera as it is.
+        late: (cameras,) or (cameras, frames) [frame]; NaN or 0 leaves a camera as it is.
 
     Returns:
         Keypoints (frames, cameras, persons, joints, 2), confidence, and the matching index; so are
@@ -351,7 +376,7 @@ def shift_in_time(detections: KeypointDetections, late: Floats) -> KeypointDetec
         pixels = np.concatenate([pixels, detections.extra_keypoints[place]], axis=-2)
         weights = np.concatenate([weights, detections.extra_confidence[place]], axis=-1)
     weights = np.where(there & np.isfinite(pixels).all(axis=-1), weights, np.nan)
-    for camera in np.flatnonzero(np.nan_to_num(late)):
+    for camera in np.flatnonzero(np.nan_to_num(late).reshape(len(late), -1).any(axis=1)):
         time = np.arange(frames) - late[camera]
         before = np.floor(time).astype(np.int64)
         share = time - before

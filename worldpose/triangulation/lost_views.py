@@ -19,10 +19,9 @@ from scipy.ndimage import uniform_filter
 from data_contracts.arrays import AnyFloats, ClipArray, Flags, Floats, Integers
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import KeypointDetections
-from worldpose.camera_consistency.changes import Change, Kind
-from worldpose.camera_consistency.health import UNKNOWNS
 from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.camera_changes import MeasuredChange
+from worldpose.triangulation.change_sums import WIDTH, Kind
 
 
 def find_lost_views(
@@ -50,7 +49,7 @@ def find_lost_views(
     each = (_Meetings(cameras[c], seen[:, c], people, fps) for c in range(len(cameras.focal)))
     found = [camera.find_change(c, kinds) for c, camera in enumerate(each)]
     lost = [change for change in found if change is not None]
-    return sorted(lost, key=lambda change: -change.found.gain)
+    return sorted(lost, key=lambda change: -change.gain)
 
 
 _TORSO = [COCO17.index(f"{side}_{at}") for side in ("left", "right") for at in ("shoulder", "hip")]
@@ -117,16 +116,15 @@ class _Meetings:
         # The tracker follows less: such a change is found from its people.
         if abs(late) < 3 and np.linalg.norm(shift) < 0.5 * self._reach(chosen):
             return None
-        amount = np.zeros(UNKNOWNS)
+        amount = np.zeros(WIDTH)
         amount[:2], amount[4] = shift, late
         near = np.arange(
             max(0, rows[place] - 2 * second), min(len(self.seen), rows[place] + 2 * second)
         )
         gain = self._met(near) - self._met(near, late=late, shift=shift)
         row = int(near[int(np.argmax(np.concatenate([[0], np.cumsum(gain)])[: len(near)]))])
-        size = float(late or np.linalg.norm(shift))
         again = (by[kind] - now) * seen.mean() * (len(rows) - place)
-        return MeasuredChange(Change(number, kind, True, row, size, again), amount, np.inf)
+        return MeasuredChange(number, kind, row, amount, gain=again)
 
     def _count(self, rows: Integers) -> Integers:
         """Return the number (n,) of detections."""
