@@ -27,9 +27,9 @@ from flows.stage import Match
 from worldpose.bundle_adjustment.people_cameras import CamerasFromPeople, KnownLength
 from worldpose.bundle_adjustment.people_cameras import locate_cameras as estimate
 from worldpose.errors import InputError, UsageError
+from worldpose.formats.calibration_unit import square_focal
 from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.formats.files import whole_file
-from worldpose.formats.lens_files import square_focal
 from worldpose.ingest.match_folder import LENS_FILE
 from worldpose.store.store import Run, Store
 

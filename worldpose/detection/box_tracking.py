@@ -20,9 +20,6 @@ PLACE_NOISE: Final = 1.0 / 20.0
 SPEED_NOISE: Final = 1.0 / 160.0
 """Standard deviation of their change per frame, over the height [1/frame]; ByteTrack's."""
 
-MOST_WAITING: Final = 32
-"""Frames that wait for a batch of detectors, if `stride` or `batch` is not larger: 0.8 GB of 4K."""
-
 _STEP = np.eye(8) + np.eye(8, k=4)
 """Transition matrix: speeds move positions."""
 
@@ -284,7 +281,8 @@ def detect_strided(
         waiting.append((number, image))
         choose_last_image()
         searched = number
-        if len(chosen) == settings.batch or len(waiting) >= max(settings.batch, MOST_WAITING):
+        # 32 frames of 4K take 0.8 GB.
+        if len(chosen) == settings.batch or len(waiting) >= max(settings.batch, 32):
             yield from iterate_found()
     choose_last_image()  # so that boxes reach the last frame
     yield from iterate_found()

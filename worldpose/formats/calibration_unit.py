@@ -112,3 +112,20 @@ def toml_unit_m(path: Path, content: Mapping[str, Any] | None = None) -> float:
         found = "no ground plane: the world is that of the first camera"
         raise InputError(where, expected, found, todo)
     return MILLIMETRE
+
+
+def square_focal(focal: Sequence[float], where: str) -> tuple[float, float]:
+    """Return the mean of fx and fy [px], and half their difference.
+
+    Raises:
+        InputError: they differ too much for square pixels.
+    """
+    fx, fy = focal
+    if abs(fx - fy) > 0.02 * fx:
+        raise InputError(
+            f"{where}.matrix",
+            expected="fx and fy of square pixels, within 2 %",
+            found=f"{fx:g} and {fy:g}",
+            todo="Correct the calibration file.",
+        )
+    return 0.5 * (fx + fy), 0.5 * abs(fx - fy)

@@ -30,7 +30,7 @@ from worldpose.formats.calibration_files import (
     read_optics,
     require_optics,
 )
-from worldpose.formats.calibration_unit import require_middle
+from worldpose.formats.calibration_unit import require_middle, square_focal
 from worldpose.formats.files import (
     SETTINGS_BYTES,
     by_last_number,
@@ -457,20 +457,6 @@ def _lens(
 
     Camera.from_lens(lens).require_rays(where)
     return lens
-
-
-def square_focal(focal: Sequence[float], where: str) -> tuple[float, float]:
-    """Return the mean of fx and fy [px], and half their difference.
-
-    Raises:
-        InputError: they differ too much for square pixels.
-    """
-    fx, fy = focal
-    if abs(fx - fy) > 0.02 * fx:
-        raise calibration_error(
-            f"{where}.matrix", "fx and fy of square pixels, within 2 %", f"{fx:g} and {fy:g}"
-        )
-    return 0.5 * (fx + fy), 0.5 * abs(fx - fy)
 
 
 def _deviation(

@@ -46,10 +46,6 @@ MIN_GAIN: Final[dict[Kind, float]] = {"clock": 30.0, "view": 60.0}
 """Least decrease of the sum of squares by a drift or a step, in variances of the noise [1]; half of
 it in the seconds around a step. People who walk to another place meet other errors of the
 calibration, a slow change."""
-MAX_FURTHER: Final = 4
-"""Most parts that one fit adds."""
-MIN_SHARE: Final = 0.2
-"""Least gain of a further part, over that of the largest one [1]."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +120,7 @@ def fit_parts(
     fit = _prune(_Fit.of(sums, parts, frames))
     # A change is noise until all are fitted: several are added, and those that are clear stay.
     grown = fit
-    for _ in range(MAX_FURTHER):
+    for _ in range(4):
         further = grown.find_part(kinds)
         if further is None:
             break
@@ -132,11 +128,12 @@ def fit_parts(
     grown = _prune(grown)
     known = {part.place for part in fit.parts}
     gains = [grown.gain_of(k) * (part.place not in known) for k, part in enumerate(grown.parts)]
-    # What is small beside the largest can be its curvature: it waits until that is taken back.
+    # What gains less than a fifth of the largest can be its curvature: it waits until that is taken
+    # back.
     kept = [
         part
         for part, gain in zip(grown.sized(), gains, strict=True)
-        if part.place in known or gain > MIN_SHARE * max(gains)
+        if part.place in known or gain > 0.2 * max(gains)
     ]
     # Where several views jump at once, it was a person whom the tracker took for another.
     steps = [(p.camera, p.row) for p in kept if p.name[1:] == ("view", "step")]
@@ -195,7 +192,7 @@ def on_common_clock(parts: Sequence[Part]) -> list[Part]:
 
     A common offset changes no residual: most clocks keep theirs.
     """
-    changing = {part.camera for part in parts if (part.kind, part.shape) in _CLOCK_CHANGES}
+    changing = {p.camera for p in parts if p.kind == "clock" and p.shape != "constant"}
     common = np.median([part.size[0] for part in parts if part.shape == "constant"])
     return [
         replace(part, size=(part.size[0] - common if part.camera in changing else 0.0,))
@@ -203,9 +200,6 @@ def on_common_clock(parts: Sequence[Part]) -> list[Part]:
         else part
         for part in parts
     ]
-
-
-_CLOCK_CHANGES: Final = {("clock", "drift"), ("clock", "step")}
 
 
 def is_settled(before: Sequence[Part], after: Sequence[Part]) -> bool:
