@@ -2,14 +2,19 @@
 
 import errno
 import json
+import shutil
 
 import numpy as np
 import pytest
+from run_records import calibration
 from typer.testing import CliRunner
 
 from flows.cli.app import app
+from flows.web.draft_problems import take_given
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.calibration_forms import read_calibration
+from worldpose.formats.calibration_writer import write_calibration_toml
+from worldpose.store.store import Store
 from worldpose.video.files import write_video
 
 TABLE = """
@@ -195,3 +200,27 @@ def test_a_stated_unit_and_axis_hold_and_absurd_distances_are_refused(filmed):
     np.testing.assert_allclose(np.array(found.rotation)[:, 2], [0.0, -1.0, 0.0], atol=1e-12)
     for option, value in (("--unit", "cm"), ("--up", "y")):
         assert isinstance(run(*videos, *out, option, value).exception, UsageError)
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (("cam00_half1.npz", "cam00_half2.npz"), "one file with 2D poses of cam00"),
+        (("cam00.npz", "cam001.npz"), "with a name that begins"),
+        (("calibration.toml",), "one calibration"),
+    ],
+)
+def test_a_file_of_another_tool_replaces_none(tiny, tmp_path, names, expected):
+    folder, given = tmp_path / "match", tmp_path / "given"
+    given.mkdir()
+    shutil.copytree(tiny, folder, ignore=lambda *_: {"detections", "calibration.toml"})
+    for name in names:
+        source = tiny / "detections" / "cam00.npz"
+        if name.endswith(".toml"):
+            source = folder / name
+            write_calibration_toml(source, {"cam00": calibration("cam00")})
+        shutil.copy(source, given / name)
+    before = {file: file.read_bytes() for file in folder.glob("*.toml")}
+    with pytest.raises(InputError, match=expected):
+        take_given(Store.open_or_new(tmp_path / "store"), given, folder, {})
+    assert {file: file.read_bytes() for file in folder.glob("*.toml")} == before

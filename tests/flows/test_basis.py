@@ -8,7 +8,8 @@ from flows.gates import Gatekeeper
 from flows.registering import register
 from flows.run_plan import RunPlan, plan_run
 from flows.run_record import RunLog, latest_run
-from flows.settings import selected_stages
+from flows.settings import parse_overrides, selected_stages
+from worldpose.errors import UsageError
 from worldpose.store.store import Store
 
 OTHER = {"tracking": {"min_joints": 6}}
@@ -51,3 +52,17 @@ def test_a_later_stage_goes_on_with_the_pass_that_the_latest_run_was_made_of(cli
     planned = plan.plan_stage(stages[0])
     assert {unit.key for unit in planned} <= set(latest.results.values())
     assert {unit.iteration for unit in planned} == {2}
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("detection.stride=true", "true"),
+        ("tracking.gate_m=true", "true"),
+        ("detection.zooms=[true, 2]", "[true, 2]"),
+    ],
+)
+def test_true_is_no_number(text, found):
+    with pytest.raises(UsageError, match="number") as refused:
+        parse_overrides([text])
+    assert refused.value.found == found

@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import page_client
 import pytest
-from run_records import calibration
 
 from flows.registering import register
 from flows.service.inbox import entries, fingerprint_of, missing_of, watch_once
@@ -20,10 +19,7 @@ from flows.service.layout import served_state
 from flows.web.access import access_for
 from flows.web.app import create_app
 from flows.web.draft_folder import SPARE_BYTES
-from flows.web.draft_problems import take_given
 from flows.web.intake import CHUNK_BYTES, Intake
-from worldpose.errors import InputError
-from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.ingest.match_folder import read_match
 from worldpose.store.store import Store
 from worldpose.video.files import write_video
@@ -500,27 +496,3 @@ def test_a_kill_between_the_move_and_the_end_leaves_a_match_and_no_draft(place, 
     assert ada.get(DRAFTS).json() == {"drafts": []}
     assert not folder.exists()
     assert (place / "inbox" / "final" / "match.yaml").exists()
-
-
-@pytest.mark.parametrize(
-    ("names", "expected"),
-    [
-        (("cam00_half1.npz", "cam00_half2.npz"), "one file with 2D poses of cam00"),
-        (("cam00.npz", "cam001.npz"), "with a name that begins"),
-        (("calibration.toml",), "one calibration"),
-    ],
-)
-def test_a_file_of_another_tool_replaces_none(tiny, tmp_path, names, expected):
-    folder, given = tmp_path / "match", tmp_path / "given"
-    given.mkdir()
-    shutil.copytree(tiny, folder, ignore=lambda *_: {"detections", "calibration.toml"})
-    for name in names:
-        source = tiny / "detections" / "cam00.npz"
-        if name.endswith(".toml"):
-            source = folder / name
-            write_calibration_toml(source, {"cam00": calibration("cam00")})
-        shutil.copy(source, given / name)
-    before = {file: file.read_bytes() for file in folder.glob("*.toml")}
-    with pytest.raises(InputError, match=expected):
-        take_given(Store.open_or_new(tmp_path / "store"), given, folder, {})
-    assert {file: file.read_bytes() for file in folder.glob("*.toml")} == before

@@ -14,9 +14,11 @@ import yaml
 from command_line import TINY, succeed, worldpose
 
 from data_contracts.conventions import COCO17, JOINT_GROUPS
+from flows.layers import write_layer
 from flows.registering import open_match
 from flows.reports import report, viewer
 from flows.reports.people import body_tables
+from flows.results.automatic_exports import export_after_run
 from flows.results.best_results import LIMB_ENDS
 from worldpose import open_run
 from worldpose.body.body_file import load_open_body
@@ -234,3 +236,14 @@ def test_a_reference_that_is_not_scored_is_said(tiny, project_copy, tmp_path, mo
     assert "the run has 0 clips" in said and "clip by clip" not in said
     shutil.copy(tiny / "reference" / "joints.npz", own)
     assert report._against_truth(store, run, match, None)[2] == ""  # nobody asked for it
+
+
+def test_a_run_without_people_exports_its_cameras_alone(store):
+    write_layer(store, "project", {"exports": ["joints", "worldpose", "slahmr-cameras"]})
+    record = store.run(TINY)
+    calibrated = {n: key for n, key in record.results.items() if n.startswith("static_cal")}
+    cameras = [f"{name.partition('/')[2]}.npz" for name in sorted(calibrated)]
+    for results, names in (({}, []), (calibrated, cameras)):
+        without = record.model_copy(update={"results": results})
+        files = export_after_run(store, open_match(store, TINY), without)
+        assert [file.name for file in files if file.suffix == ".npz"] == names

@@ -22,7 +22,6 @@ from flows.layers import known_pitch, project_layers, read_layer, write_layer
 from flows.progress import reporting_to
 from flows.registering import open_match, register
 from flows.reports.match_pictures import shown_pitch
-from flows.results.automatic_exports import export_after_run
 from flows.results.best_results import Origin
 from flows.run_plan import plan_run
 from flows.running import RunRequest, settle
@@ -32,7 +31,7 @@ from flows.settings import parse_overrides, resolve
 from flows.web import app_context
 from flows.web import settings as page_settings
 from worldpose.body.body_file import load_open_body, save_body
-from worldpose.errors import InputError, UsageError
+from worldpose.errors import InputError
 from worldpose.ingest.match_folder import read_match
 from worldpose.store.run_queue import queue_of
 from worldpose.store.store import Run, Store
@@ -406,20 +405,6 @@ def test_exports_have_the_pitch_of_the_layers(store):
     assert layers.pitch_of_run(part, lambda: used) is used
 
 
-@pytest.mark.parametrize(
-    ("text", "found"),
-    [
-        ("detection.stride=true", "true"),
-        ("tracking.gate_m=true", "true"),
-        ("detection.zooms=[true, 2]", "[true, 2]"),
-    ],
-)
-def test_true_is_no_number(text, found):
-    with pytest.raises(UsageError, match="number") as refused:
-        parse_overrides([text])
-    assert refused.value.found == found
-
-
 def test_weights_have_the_same_path_at_every_door(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     given = parse_overrides(["detection.detector=onnx-rtmdet:net.onnx", "detection.pose=embedded"])
@@ -506,14 +491,3 @@ def test_default_settings_says_what_it_removes(store):
     (text,) = (each for each in told if "--default-settings" in each)
     assert "removes triangulation.min_views=4" in text
     assert read_layer(store, f"matches/{TINY}").values == {"venue": None, "tracking.gate_m": 0.6}
-
-
-def test_a_run_without_people_exports_its_cameras_alone(store):
-    write_layer(store, "project", {"exports": ["joints", "worldpose", "slahmr-cameras"]})
-    record = store.run(TINY)
-    calibrated = {n: key for n, key in record.results.items() if n.startswith("static_cal")}
-    cameras = [f"{name.partition('/')[2]}.npz" for name in sorted(calibrated)]
-    for results, names in (({}, []), (calibrated, cameras)):
-        without = record.model_copy(update={"results": results})
-        files = export_after_run(store, open_match(store, TINY), without)
-        assert [file.name for file in files if file.suffix == ".npz"] == names
