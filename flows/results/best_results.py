@@ -124,7 +124,11 @@ def describe_age(store: Store, record: RunRecord) -> str:
     if later := describe_later(store, record):
         return later
     now = read_summary(store, record.match_id)
-    return f"These results are {now.words}. {now.todo}" if now.kind == "outdated" else ""
+    if now.kind == "outdated":
+        return f"These results are {now.words}. {now.todo}"
+    # Open questions or a run at work say nothing about the results that are there.
+    stale = now.units.get("stale", ())
+    return f"Of these results, a run would compute {', '.join(stale)} anew." if stale else ""
 
 
 def describe_later(store: Store, record: RunRecord) -> str:

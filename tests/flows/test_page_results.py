@@ -171,6 +171,9 @@ def test_results_say_which_change_made_them_old(ada, project_copy, tmp_path):
     out = ["--out", str(tmp_path / "out"), "--project", project_copy]
     answer = worldpose("export", TINY, "--format", "joints", *out)
     assert (answer.code, said in answer.err) == (0, True), answer.err
+    store.reserve_run(TINY)  # of this process, which is at work
+    answer = worldpose("export", TINY, "--format", "joints", *out)
+    assert "Of these results, a run would compute tracking/clip" in answer.err
 
 
 def test_a_run_without_people_is_a_clear_message(ingested, tmp_path):
