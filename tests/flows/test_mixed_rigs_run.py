@@ -194,7 +194,7 @@ def test_a_zoom_is_told_and_hides_no_knock_of_another_camera(imported, clip_join
         cam0=lambda pixels: np.concatenate([pixels[:90], pixels[90:] + KNOCK]),
     )
     said, _ = run_to_triangulation(match, clip_joints)
-    assert "camera cam2: it moves within the clip, near frame 60" in said
+    assert "camera cam2: it moves within the clip" in said
     assert "camera cam0 moves at frame 90" in said
 
 

@@ -11,6 +11,7 @@ one at which T is far larger; for drifts, T compares long blocks with the mean o
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal, Self
@@ -103,8 +104,12 @@ class ChangeSums:
         prior = np.diag(_INFORMATION[UNKNOWNS[kind]])
         near = min(3.0 * self.fps, 0.2 * (np.ptp(self.rows) + 1.0))
         inner = (self.rows - self.rows[0] >= 0.5 * near) & (self.rows[-1] - self.rows >= 0.5 * near)
-        first, last = np.searchsorted(self.rows, [self.rows - near, self.rows + near])
         here = np.arange(len(self.rows))
+        # As many bins on both sides of frames that are left out.
+        count = near / np.diff(self.rows).min(initial=near)
+        first, last = (
+            np.clip(here + n, 0, len(here)) for n in (-math.floor(count), math.ceil(count))
+        )
         before, one = _solve_blocks(matrix, score, first, here, prior)
         after, other = _solve_blocks(matrix, score, here, last, prior)
         off = after - before
