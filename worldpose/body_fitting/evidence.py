@@ -74,12 +74,15 @@ def random_covariance(covariance: Floats, common_bias: Floats) -> Floats:
         covariance: (..., 17, 3, 3) [m^2], of triangulated joints or of bodies.
         common_bias: (17,) per axis [m], included in `covariance`.
     """
-    # 1 cm per axis stays; the shared offsets model the rest.
-    modelled = np.maximum(common_bias**2 - 0.01**2, 0.0)
     random = covariance.astype(np.float64)
     for axis in range(3):
-        random[..., axis, axis] -= modelled
+        random[..., axis, axis] -= modelled_variance(common_bias)
     return random
+
+
+def modelled_variance(common_bias: Floats) -> Floats:
+    """Return the variance per axis [m^2] that the shared offsets model, of a bias [m]."""
+    return np.asarray(np.maximum(common_bias**2 - 0.01**2, 0.0))  # 1 cm per axis stays
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats
 from worldpose.body.model import BODY_POSE, BodyModel, BodyParameters
-from worldpose.body_fitting.evidence import body_axes, random_covariance
+from worldpose.body_fitting.evidence import body_axes, modelled_variance
 from worldpose.body_fitting.monocular import MonocularPoses
 from worldpose.body_fitting.poses import PoseSolver
 from worldpose.body_fitting.ray_constraints import RayConstraints
@@ -90,10 +90,19 @@ class ClipEvidence:
         """Raise InputError if `covariance` is smaller than the square of `common_bias`."""
         if not self.bias.any():
             return
-        left = random_covariance(self.covariance, self.bias)[self.joint_seen]
-        total = np.trace(self.covariance[self.joint_seen], axis1=-2, axis2=-1)
+        seen = self.joint_seen
+        xx, yy, zz, xy, xz, yz = (
+            self.covariance[..., a, b][seen].astype(np.float64)
+            for a, b in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+        )
         # Numbers of a file are rounded to float32.
-        short = np.linalg.eigvalsh(left)[:, 0] < -1e-6 * total
+        less = np.broadcast_to(modelled_variance(self.bias), seen.shape)[seen]
+        less -= 1e-6 * (xx + yy + zz)
+        xx, yy, zz = xx - less, yy - less, zz - less
+        # Sylvester's criterion: eigenvalues of all joints of a clip take a second.
+        minor = xx * yy - xy**2
+        whole = zz * minor - xx * yz**2 - yy * xz**2 + 2.0 * xy * xz * yz
+        short = (xx < 0.0) | (minor < 0.0) | (whole < 0.0)
         if short.any():
             raise InputError(
                 "body fitting: common_bias",
