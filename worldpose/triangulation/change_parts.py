@@ -391,8 +391,8 @@ class _Fit:
         follow = self.columns.swapaxes(1, 2) @ self.sums.matrix[:, :, own]
         shares = np.stack([part.share(self.sums.rows, self.frames) for part in candidates])
         held = self.sums.matrix[:, own[:, None], own]
-        total = np.einsum("nb,bij->nij", shares**2, held)
-        fixed = np.einsum("nb,bki->nki", shares, follow)
+        total = np.tensordot(shares**2, held, axes=1)
+        fixed = np.tensordot(shares, follow, axes=1)
         stays = total - fixed.swapaxes(1, 2) @ self.covariance @ fixed
         # What the others explain as well, a part cannot tell.
         stays += 1e-3 * total * np.eye(len(own)) + 1e-9 * np.eye(len(own))

@@ -18,7 +18,7 @@ from typing import Final, Literal, Self
 
 import numpy as np
 from scipy.ndimage import convolve1d
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
@@ -162,7 +162,7 @@ class ChangeSums:
         """Return the noise by kind, and whether for drifts."""
         noise: Noise = {}
         for kind, unknowns in UNKNOWNS.items():
-            usual = float(chi2.median(len(unknowns)))
+            usual = float(chdtri(len(unknowns), 0.5))
             steps = [_median(self.steps(c, kind)) for c in range(self.cameras)]
             bends = [_median(self.bends(c, kind)) for c in range(self.cameras)]
             own = np.maximum(1.0, np.array(steps) / usual)
@@ -185,7 +185,7 @@ class ChangeSums:
         if not len(off):
             return np.ones(self.cameras)
         variance = own[1:-1] + 0.25 * (own[:-2] + own[2:])
-        middle = np.median(off**2 / variance, axis=0) / float(chi2.median(1))
+        middle = np.median(off**2 / variance, axis=0) / float(chdtri(1, 0.5))
         return np.asarray(np.maximum(1.0, middle))
 
 

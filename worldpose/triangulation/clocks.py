@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from data_contracts.arrays import AnyFloats, ClipArray, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import Record
-from worldpose.compiled import map_in_threads
+from worldpose.compiled import compile_kernel, map_in_threads
 from worldpose.geometry import camera_model
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.optimize.losses import geman_mcclure_weight
@@ -281,43 +281,101 @@ def sum_equations(moving: MovingJoints, *, with_cameras: bool = False) -> Person
     The unknowns of a camera are its clock offset [frame] and, if `with_cameras`, its rotation [rad]
     and the logarithm of its focal length.
     """
-    rig, person = moving.rig, moving.person
-    n, count, width = len(moving.at), len(rig.cameras), 5 if with_cameras else 1
-    matrix, right = np.tile(1e-9 * np.eye(3), (n, 1, 1)), np.zeros((n, 3, 1))
-    mixed, own = np.zeros((n, count, width, 3)), np.zeros((n, count, width, width))
-    score, shared = np.zeros((n, count, width)), np.zeros((3, count))
+    rig, count, width = moving.rig, len(moving.rig.cameras), 5 if with_cameras else 1
+    place, shared = np.full((len(moving.at), count), -1), np.zeros((3, count))
+    views: list[tuple[Floats, ...]] = []
     for camera in range(count):
         derivatives, miss, weight, size = moving.look(camera)
-        by_point = np.ascontiguousarray(derivatives[..., :3])
-        columns = by_point @ moving.velocity[..., None]
+        seen = np.flatnonzero(weight)
+        place[seen, camera] = sum(len(view[0]) for view in views) + np.arange(len(seen))
+        derivatives, miss, weight = derivatives[seen], miss[seen], weight[seen]
+        by_point, size = derivatives[..., :3], size[seen]
+        columns = np.einsum("nij,nj->ni", by_point, moving.velocity[seen])[..., None]
         motion = np.linalg.norm(columns[..., 0], axis=-1)
         if with_cameras:
             focal = (derivatives[..., 9:11] * rig.cameras[camera, :2]).sum(axis=-1, keepdims=True)
             columns = np.concatenate([columns, derivatives[..., 3:6], focal], axis=-1)
-        held_points = (weight[:, None, None] * by_point).swapaxes(-1, -2)
-        held = (weight[:, None, None] * columns).swapaxes(-1, -2)
-        matrix += held_points @ by_point
-        right += held_points @ miss[..., None]
-        mixed[:, camera], own[:, camera] = held @ by_point, held @ columns
-        score[:, camera] = (held @ miss[..., None])[..., 0]
         shared[0, camera] = (weight * motion * size).sum()
         shared[1, camera] = (weight * (miss**2).sum(axis=-1)).sum()
         shared[2, camera] = (weight * size**2).sum()
-    flat = mixed.reshape(n, count * width, 3)
-    follows = flat @ np.linalg.inv(matrix)
-    left = score.reshape(n, count * width) - (follows @ right)[..., 0]
-    people = np.unique(person)
+        views.append((by_point, columns, miss, weight))
+    people, group = np.unique(moving.person, return_inverse=True)
     information = np.zeros((len(people), count, width, count, width))
-    total = np.zeros((len(people), count * width))
-    for number, one in enumerate(people):
-        its = person == one
-        moved, pulled = (
-            each[its].swapaxes(0, 1).reshape(count * width, -1) for each in (follows, flat)
-        )
-        information[number] = -(moved @ pulled.T).reshape(information.shape[1:])
-        information[number, range(count), :, range(count)] += own[its].sum(axis=0)
-        total[number] = left[its].sum(axis=0)
-    return PersonSums(information.reshape(len(people), *(count * width,) * 2), total, shared)
+    score = np.zeros((len(people), count, width))
+    joined = (np.concatenate(each) for each in zip(*views, strict=True))
+    _eliminate_points(place, group, *joined, information, score)
+    size = count * width
+    return PersonSums(
+        information.reshape(len(people), size, size), score.reshape(len(people), size), shared
+    )
+
+
+@compile_kernel
+def _eliminate_points(
+    place: Integers,
+    group: Integers,
+    by_point: Floats,
+    columns: Floats,
+    miss: Floats,
+    weight: Floats,
+    information: Floats,
+    score: Floats,
+) -> None:
+    """Add normal equations of cameras by group, with each point free to follow.
+
+    With P, C the derivatives by point and camera, m the miss, w the weight, in views c and d:
+    H_cd = [c = d] w C^T C - X_c V^-1 X_d^T and g_c = w C^T m - X_c V^-1 (sum w P^T m), where
+    X = w C^T P and V = sum w P^T P.
+
+    Args:
+        place: (n, cameras) row of a point's view in the next four; -1 = none.
+        group: (n,).
+        by_point: (rows, 2, 3).
+        columns: (rows, 2, k).
+        miss: (rows, 2) [px].
+        weight: (rows,) [1/px^2].
+        information: (groups, cameras, k, cameras, k), added to.
+        score: (groups, cameras, k), added to.
+    """
+    cameras, width = place.shape[1], columns.shape[2]
+    mixed, follows = np.empty((cameras, width, 3)), np.empty((cameras, width, 3))
+    for i in range(len(place)):
+        held, right, g = 1e-9 * np.eye(3), np.zeros(3), group[i]
+        seen = np.flatnonzero(place[i] >= 0)
+        for c in seen:
+            k = place[i, c]
+            for row in range(2):
+                for a in range(3):
+                    pull = weight[k] * by_point[k, row, a]
+                    right[a] += pull * miss[k, row]
+                    for b in range(3):
+                        held[a, b] += pull * by_point[k, row, b]
+        inverse = np.linalg.inv(held)
+        for c in seen:
+            k = place[i, c]
+            for a in range(width):
+                first, second = weight[k] * columns[k, 0, a], weight[k] * columns[k, 1, a]
+                for b in range(3):
+                    mixed[c, a, b] = first * by_point[k, 0, b] + second * by_point[k, 1, b]
+                score[g, c, a] += first * miss[k, 0] + second * miss[k, 1]
+                for b in range(width):
+                    own = first * columns[k, 0, b] + second * columns[k, 1, b]
+                    information[g, c, a, c, b] += own
+                for b in range(3):
+                    follows[c, a, b] = (
+                        mixed[c, a, 0] * inverse[0, b]
+                        + mixed[c, a, 1] * inverse[1, b]
+                        + mixed[c, a, 2] * inverse[2, b]
+                    )
+                    score[g, c, a] -= follows[c, a, b] * right[b]
+        for c in seen:
+            for a in range(width):
+                x, y, z = follows[c, a]
+                for d in seen:
+                    for b in range(width):
+                        information[g, c, a, d, b] -= (
+                            x * mixed[d, b, 0] + y * mixed[d, b, 1] + z * mixed[d, b, 2]
+                        )
 
 
 def read_frames(
