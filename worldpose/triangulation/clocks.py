@@ -302,12 +302,10 @@ def sum_equations(moving: MovingJoints, *, with_cameras: bool = False) -> Person
     people, group = np.unique(moving.person, return_inverse=True)
     information = np.zeros((len(people), count, width, count, width))
     score = np.zeros((len(people), count, width))
-    joined = (np.concatenate(each) for each in zip(*views, strict=True))
-    _eliminate_points(place, group, *joined, information, score)
-    size = count * width
-    return PersonSums(
-        information.reshape(len(people), size, size), score.reshape(len(people), size), shared
-    )
+    by_point, columns, miss, weight = (np.concatenate(each) for each in zip(*views, strict=True))
+    _eliminate_points(place, group, by_point, columns, miss, weight, information, score)
+    score = score.reshape(len(people), count * width)
+    return PersonSums(information.reshape(*score.shape, count * width), score, shared)
 
 
 @compile_kernel
