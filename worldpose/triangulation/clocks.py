@@ -285,27 +285,27 @@ def sum_equations(moving: MovingJoints, *, with_cameras: bool = False) -> Person
     place, shared = np.full((len(moving.at), count), -1), np.zeros((3, count))
     views: list[tuple[Floats, ...]] = []
     for camera in range(count):
-        derivatives, miss, weight, size = moving.look(camera)
+        derivatives, miss, weight, scale = moving.look(camera)
         seen = np.flatnonzero(weight)
         place[seen, camera] = sum(len(view[0]) for view in views) + np.arange(len(seen))
         derivatives, miss, weight = derivatives[seen], miss[seen], weight[seen]
-        by_point, size = derivatives[..., :3], size[seen]
+        by_point, scale = derivatives[..., :3], scale[seen]
         columns = np.einsum("nij,nj->ni", by_point, moving.velocity[seen])[..., None]
         motion = np.linalg.norm(columns[..., 0], axis=-1)
         if with_cameras:
             focal = (derivatives[..., 9:11] * rig.cameras[camera, :2]).sum(axis=-1, keepdims=True)
             columns = np.concatenate([columns, derivatives[..., 3:6], focal], axis=-1)
-        shared[0, camera] = (weight * motion * size).sum()
+        shared[0, camera] = (weight * motion * scale).sum()
         shared[1, camera] = (weight * (miss**2).sum(axis=-1)).sum()
-        shared[2, camera] = (weight * size**2).sum()
+        shared[2, camera] = (weight * scale**2).sum()
         views.append((by_point, columns, miss, weight))
     people, group = np.unique(moving.person, return_inverse=True)
     information = np.zeros((len(people), count, width, count, width))
     score = np.zeros((len(people), count, width))
     by_point, columns, miss, weight = (np.concatenate(each) for each in zip(*views, strict=True))
     _eliminate_points(place, group, by_point, columns, miss, weight, information, score)
-    score = score.reshape(len(people), count * width)
-    return PersonSums(information.reshape(*score.shape, count * width), score, shared)
+    size = (len(people), count * width)
+    return PersonSums(information.reshape(*size, size[1]), score.reshape(size), shared)
 
 
 @compile_kernel
