@@ -20,6 +20,7 @@ from flows.layers import pitch_of, pitch_of_run
 from flows.overview import read_summary
 from flows.results.run_cameras import (
     BROADCAST,
+    TRIANGULATED,
     broadcast_unit,
     broadcast_views,
     camera_in_frames,
@@ -478,15 +479,15 @@ def _with_tracked_joints(
     return joints, views
 
 
-def placed_joints(run: Run, clip: str) -> xr.Dataset:
-    """Return the best triangulated joints of one clip, with their contributing views.
+def placed_joints(run: Run, clip: str, stage: str | None = None) -> xr.Dataset:
+    """Return the joints of one clip that `stage` or the best one triangulated, with their views.
 
     Raises:
         UsageError: the run has none.
     """
-    for stage in ("retriangulation", "triangulation"):
-        if f"{stage}/{clip}" in run:
-            return _stage_joints(run, clip, stage)
+    for each in TRIANGULATED[stage == "triangulation" :]:
+        if f"{each}/{clip}" in run:
+            return _stage_joints(run, clip, each)
     raise UsageError(
         f"clip {clip}",
         expected="triangulated joints",

@@ -130,9 +130,8 @@ def test_labels_are_where_people_are_at_the_moments_of_the_images(match_folder, 
     np.testing.assert_allclose(places[0.4] - places[0.0], 0.4 * 0.1 * 4000 / 70, rtol=0.02)
 
 
-def test_labels_of_a_drifting_static_camera_are_at_its_images(match_folder, tmp_path):
-    moving = bodies()
-    moving["transl"][:, :, 0] += 0.1 * np.arange(4)[:, None]
+def static_rig(*changes, inliers=True):
+    """Results with camera north, 70 m in front of the centre spot, and changes of its view."""
     pose = Rigid(
         np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), np.r_[0.0, 2.0, 70.0]
     )
@@ -142,11 +141,57 @@ def test_labels_of_a_drifting_static_camera_are_at_its_images(match_folder, tmp_
         name: ((f"{name}_0", *(f"{name}_{n + 1}" for n in range(each.ndim - 1))), each)
         for name, each in arrays
     }
-    static = xr.Dataset(cameras, coords={"camera": ["north"]})
     known = tracked()
-    results = {name: known[name] for name in ("tracking__A_1", "triangulation__A_1")}
-    results["triangulation__A_1"].attrs["changes"] = []
-    results |= {"body_fitting__A_1": moving, "bundle_adjustment__cameras": static}
+    results = {name: known[name] for name in known if "broadcast" not in name}
+    whole = {"camera": "north", "kind": "view", "first_frame": 100, "frame_count": 4, "std": None}
+    placed = results["triangulation__A_1"].assign_coords(camera=["north"])
+    placed["inliers"] = (("frame", "camera", "person", "joint"), np.full((4, 1, 2, 17), inliers))
+    placed.attrs["changes"] = [whole | change for change in changes]
+    static = xr.Dataset(cameras, coords={"camera": ["north"]})
+    return results | {"triangulation__A_1": placed, "bundle_adjustment__cameras": static}
+
+
+def test_images_that_a_run_leaves_out_are_no_labels_of_an_empty_pitch(
+    match_folder, tmp_path, caplog
+):
+    unknown = {"frame": None, "is_explained": False, "is_left_out": True}
+    nobody = static_rig()
+    nobody["body_fitting__A_1"]["joints"][:, :, :, 1] -= 200.0  # behind the camera
+    (path,) = write("coco", origin(match_folder, **nobody), tmp_path / "nobody")
+    labels = json.loads(path.read_text())
+    assert [each["id"] for each in labels["images"]] == [100, 101, 102, 103]
+    assert not labels["annotations"]
+    run = origin(match_folder, **static_rig(unknown | {"first_frame": 101, "frame_count": 2}))
+    (path,) = write("coco", run, tmp_path / "part")
+    assert [each["id"] for each in json.loads(path.read_text())["images"]] == [100, 103]
+    assert not caplog.messages
+    run = origin(match_folder, **static_rig(unknown))
+    for form in ("coco", "alphapose"):
+        assert not write(form, run, tmp_path / "none")
+        assert "no labels of camera north, whose views the run leaves out" in caplog.text
+        caplog.clear()
+
+
+def test_labels_of_a_stage_have_its_own_flags(match_folder, tmp_path, monkeypatch):
+    results = static_rig(inliers=False)
+    results["body_fitting__A_1"]["joints"] *= 0.1  # into the image
+    again = static_rig()["triangulation__A_1"]
+    for each in (results["triangulation__A_1"], again):
+        each["joints"] *= 0.1
+    run = origin(match_folder, **results, retriangulation__A_1=again)
+    known = best_results.static_cameras
+    monkeypatch.setattr(best_results, "static_cameras", lambda run, spec, _: known(run, spec))
+    for stage, flag in (("triangulation", 1), ("retriangulation", 2), ("body_fitting", 2)):
+        (path,) = write("coco", replace(run, stage=stage), tmp_path / stage)
+        labels = json.loads(path.read_text())["annotations"]
+        assert {v for each in labels for v in each["keypoints"][2::3] if v} == {flag}, stage
+
+
+def test_labels_of_a_drifting_static_camera_are_at_its_images(match_folder, tmp_path):
+    moving = bodies()
+    moving["transl"][:, :, 0] += 0.1 * np.arange(4)[:, None]
+    results = static_rig()
+    results["body_fitting__A_1"] = moving
     run = origin(match_folder, **results)
     places = {}
     for offset in (0.0, [[0, 0.25]]):
@@ -265,7 +310,7 @@ def tracked():
         fits[name] = placed[name]
     return {
         "tracking__A_1": xr.Dataset(coords=coordinates, attrs={"tracks": tracks}),
-        "triangulation__A_1": xr.Dataset(placed, coords=coordinates),
+        "triangulation__A_1": xr.Dataset(placed, coords=coordinates, attrs={"changes": []}),
         "body_fitting__A_1": fits,
         "broadcast_calibration__A_1": broadcast(),
     }

@@ -303,6 +303,12 @@ def move_on(
     return moved
 
 
+def left_out_frames(changes: Sequence[CameraChange], frame: Integers) -> Flags:
+    """Return the match frames (n,) in which the views of a camera with these changes are unused."""
+    unused = [_inside(change, frame) for change in changes if change.is_left_out]
+    return np.asarray(np.any([np.zeros(len(frame), np.bool_), *unused], axis=0))
+
+
 def correct_views(
     pixels: AnyFloats,
     frame: Integers,
