@@ -19,11 +19,9 @@ from data_contracts.tracking import Join, Track
 from flows.layers import pitch_of, pitch_of_run
 from flows.overview import read_summary
 from flows.results.run_cameras import (
-    BROADCAST,
     TRIANGULATED,
     broadcast_unit,
     broadcast_views,
-    camera_in_frames,
     clip_of,
     static_cameras,
 )
@@ -414,20 +412,6 @@ def fitted_bodies(run: Run, clip: str) -> tuple[BodyModel, BodyParameters, NDArr
         *(fits[name].values.swapaxes(0, 1) for name in ("global_orient", "body_pose", "transl")),
     )
     return fitted_model(run, unit), poses, fits["person"].values
-
-
-def filmed_cameras(run: Run, clip: str) -> dict[str, Camera]:
-    """Return the moving cameras of a clip in the frames of its bodies, (frames,), by view.
-
-    Raises:
-        InputError: the run has no such camera.
-    """
-    todo = "Calibrate the clip's broadcast camera and run the match again. A match with static "
-    todo += "cameras alone has other formats: worldpose export --format joints."
-    views = broadcast_views(run, clip) or [require_result(run, f"{BROADCAST}{clip}", todo)]
-    bodies = bodies_unit(run, clip)
-    frames = run[bodies if bodies in run else broadcast_unit(run, views[0])]["frame"].values
-    return {view: camera_in_frames(run, view, frames) for view in views}
 
 
 def require_result(run: Run, unit: str, todo: str) -> str:

@@ -19,6 +19,8 @@ from data_contracts.run import BODY_STAGES, JOINT_STAGES
 from data_contracts.triangulation import CameraChange
 from flows.results import best_results
 from flows.results.run_cameras import (
+    BROADCAST,
+    broadcast_unit,
     broadcast_views,
     camera_in_frames,
     estimated_pitch,
@@ -28,7 +30,7 @@ from flows.results.run_cameras import (
 from worldpose.body.body_file import is_open_body
 from worldpose.body.keypoints import HALPE26, fold_keypoints
 from worldpose.body.occlusions import hidden_joints
-from worldpose.errors import UsageError
+from worldpose.errors import InputError, UsageError
 from worldpose.formats import motion_capture
 from worldpose.formats.c3d_file import write_c3d
 from worldpose.formats.gltf_file import AnimatedBody, write_gltf
@@ -169,6 +171,41 @@ def export_alphapose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
             )
             motion_capture.write_json(path, labels)
             yield path
+
+
+def filmed_cameras(
+    origin: best_results.Origin, clip: str, *, leave_out: bool = False
+) -> dict[str, Camera]:
+    """Return the moving cameras of a clip in the frames of its bodies, (frames,), by view.
+
+    They are for formats whose rows are images. With `leave_out`, a warning names the cameras of
+    another frame rate, which are left out.
+
+    Raises:
+        InputError: the run has no such camera, or one of another frame rate than the match.
+    """
+    run, found = origin.run, {}
+    todo = "Calibrate the clip's broadcast camera and run the match again. A match with static "
+    todo += "cameras alone has other formats: worldpose export --format joints."
+    views = broadcast_views(run, clip)
+    views = views or [best_results.require_result(run, f"{BROADCAST}{clip}", todo)]
+    bodies = best_results.bodies_unit(run, clip)
+    frames = run[bodies if bodies in run else broadcast_unit(run, views[0])]["frame"].values
+    for view in views:
+        if (rate := unit_frames(origin.spec, view).rate) == 1.0:
+            found[view] = camera_in_frames(run, view, frames)
+            continue
+        error = InputError(
+            f"view {view}",
+            expected="the frame rate of the match, as the format has a row for each image",
+            found=f"{rate * origin.spec.fps:g} images per second, and {origin.spec.fps:g} "
+            "frames of the match",
+            todo="Set fps of the match to the camera's, or convert its video.",
+        )
+        if not leave_out:
+            raise error
+        LOG.warning("this camera is left out: %s", error)
+    return found
 
 
 @dataclass(frozen=True, eq=False)

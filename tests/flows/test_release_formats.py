@@ -19,6 +19,7 @@ from data_contracts.release import EXPORT_FORMATS, EXPORT_PURPOSES, BaselineSett
 from flows.cli.app import app
 from flows.results import best_results
 from flows.results.best_results import Origin
+from flows.results.data_set_release import _write_clip
 from flows.results.export import CLASHING, COUNTED, EXPORTS, export
 from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import CHALLENGE15, HALPE26, fold_keypoints
@@ -147,7 +148,7 @@ def static_rig(*changes, inliers=True):
     placed = results["triangulation__A_1"].assign_coords(camera=["north"])
     placed["inliers"] = (("frame", "camera", "person", "joint"), np.full((4, 1, 2, 17), inliers))
     placed.attrs["changes"] = [whole | change for change in changes]
-    static = xr.Dataset(cameras, coords={"camera": ["north"]})
+    static = xr.Dataset(cameras, coords={"camera": ["north"]}, attrs={"surface": None})
     return results | {"triangulation__A_1": placed, "bundle_adjustment__cameras": static}
 
 
@@ -170,6 +171,14 @@ def test_images_that_a_run_leaves_out_are_no_labels_of_an_empty_pitch(
         assert not write(form, run, tmp_path / "none")
         assert "no labels of camera north, whose views the run leaves out" in caplog.text
         caplog.clear()
+
+
+def test_files_of_cameras_state_that_a_view_changes(match_folder, tmp_path):
+    run = origin(match_folder, **static_rig({"frame": 102, "shift_px": (30.0, 0.0)}))
+    written = {path.name: path for path in write("worldpose", run, tmp_path)}
+    assert json.loads(written["camera_changes.json"].read_text())["A_1"][0]["frame"] == 102
+    (scene,) = write("gltf", run, tmp_path)
+    assert b"camera north moves at frame 102, by 30 px" in scene.read_bytes()
 
 
 def test_labels_of_a_stage_have_its_own_flags(match_folder, tmp_path, monkeypatch):
@@ -260,7 +269,7 @@ def test_the_broadcast_camera_joins_the_release_layout_where_there_is_one(match_
     np.testing.assert_array_equal(np.isnan(camera.focal[:, 0]), [False, False, False, True])
 
 
-def test_other_methods_get_our_boxes_as_mot_lines(match_folder, tmp_path):
+def test_other_methods_get_our_boxes_as_mot_lines(match_folder, tmp_path, caplog):
     run = origin(match_folder, body_fitting__A_1=bodies(), broadcast_calibration__A_1=broadcast())
     written = write("tracks", run, tmp_path / "out")
     assert [path.name for path in written] == ["baseline_settings.json", "A_1.txt"]
@@ -283,6 +292,11 @@ def test_other_methods_get_our_boxes_as_mot_lines(match_folder, tmp_path):
     for form in ("tracks", "challenge", "slahmr-cameras"):
         with pytest.raises(InputError, match="found 25 images per second, and 50 frames"):
             write(form, run, tmp_path / "slower")
+    with_joints = replace(run, run=origin(match_folder, **tracked()).run)
+    with pytest.raises(InputError, match="found 25 images per second, and 50 frames"):
+        _write_clip(with_joints, "A_1", "m_A_1", "train", tmp_path / "released", "none")
+    assert [path.name for path in write("worldpose", run, tmp_path / "slower")] == ["A_1.npz"]
+    assert not (tmp_path / "slower" / "cameras").exists() and "view A_1" in caplog.text
     settings = BaselineSettings.model_validate_json(written[0].read_bytes())
     assert (settings.slahmr_max_num_tracks, settings.slahmr_chunk_frames) == (30, 100)
 
