@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Integers
+from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.conventions import COCO17
 from data_contracts.match import MatchSpec, Registration
 from data_contracts.pitch import PitchSpec
@@ -198,7 +198,9 @@ def joint_tracks(
         joints = perceived_joints(joints, result["joint_offsets"].values)
     kind = 1 if stages[0] not in BODY_STAGES else 2 if definition == "detector" else 3
     source = np.where(np.isfinite(joints[..., 0]), kind, 0)
+    no_body = None
     if best and fitted and definition == "detector":
+        no_body = (source == 0).all(axis=-1)
         ends = np.isin(np.arange(len(COCO17)), LIMB_ENDS) & (source > 0)
         alone = (source == 0) & np.isfinite(seen["joints"].values[..., 0])
         for part, given, kind in ((ends, result, 3), (alone, seen, 1)):
@@ -215,7 +217,7 @@ def joint_tracks(
         identity_certainty=_identity_certainty(
             run, clip, result["frame"].values, result["person"].values
         ),
-        extra=_extra_tracks(run, f"{stages[0]}/{clip}", result, seen, definition),
+        extra=_extra_tracks(run, f"{stages[0]}/{clip}", result, seen, definition, no_body),
     )
 
 
@@ -238,11 +240,17 @@ def _identity_certainty(
 
 
 def _extra_tracks(
-    run: Run, unit: str, result: xr.Dataset, seen: xr.Dataset, definition: JointDefinition
+    run: Run,
+    unit: str,
+    result: xr.Dataset,
+    seen: xr.Dataset,
+    definition: JointDefinition,
+    alone: Flags | None,
 ) -> ExtraTracks | None:
     """Return the points besides COCO-17 of bodies or triangulated joints; None without any.
 
-    `result` is that of the unit, `seen` is the triangulation of the same people.
+    `result` is that of the unit, `seen` is the triangulation of the same people, whose points count
+    where people (frames, persons) have no body: `alone`; None = nowhere.
     """
     if "extra_joints" not in result:
         return None
@@ -256,8 +264,14 @@ def _extra_tracks(
         model = fitted_model(run, unit)
         offsets = result["extra_offsets"].values
         joints = joints + perceived_points(model, points, bodies, offsets)
-    views = seen["extra_views"].sel(point=list(points)).values.astype(np.int64)
-    return ExtraTracks(points, joints, result["extra_covariance"].values, views)
+    covariance, there = result["extra_covariance"].values, seen.sel(point=list(points))
+    if alone is not None:
+        part = np.isnan(joints[..., 0]) & alone[..., None]
+        joints = np.where(part[..., None], there["extra_joints"].values, joints)
+        given = there["extra_covariance"].values
+        covariance = np.where(part[..., None, None], given, covariance)
+    views = there["extra_views"].values.astype(np.int64)
+    return ExtraTracks(points, joints, covariance, views)
 
 
 def tracked_people(run: Run, clip: str) -> tuple[xr.Dataset, dict[int, Track]]:

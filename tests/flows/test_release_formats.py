@@ -359,6 +359,32 @@ def test_files_for_tools_say_what_they_hold(match_folder, tmp_path):
     assert b"not stated" in (tmp_path / "unstated/markers/A_1/person_003.c3d").read_bytes()
 
 
+def test_heels_and_toes_without_a_body_are_those_of_triangulation(match_folder):
+    results = tracked()
+    placed, fits = results["triangulation__A_1"], results["body_fitting__A_1"]
+    fits["joints"] = fits["joints"].copy()
+    fits["joints"][:, 1] = np.nan
+    for name in ("global_orient", "body_pose", "transl"):
+        fits[name][:, 1] = np.nan
+    fits["joint_offsets"] = (("joint", "axis_"), np.zeros((17, 3)))
+    fits["extra_offsets"] = (("point", "axis_"), np.zeros((1, 3)))
+    places = np.full((4, 2, 1, 3), 2.0)
+    for each in (placed, fits):
+        own = places if each is placed else np.where([[[[True]], [[False]]]], places, np.nan)
+        each["extra_joints"] = (("frame", "person", "point", "coordinate"), own)
+        square = ("frame", "person", "point", "coordinate", "coordinate_")
+        each["extra_covariance"] = (square, own[..., None] * 1e-4 * np.eye(3))
+    placed["extra_views"] = (("frame", "person", "point"), np.full((4, 2, 1), 3))
+    for name, each in (("triangulation__A_1", placed), ("body_fitting__A_1", fits)):
+        results[name] = each.assign_coords(point=["left_heel"])
+    run = origin(match_folder, **results).run
+    heels = best_results.joint_tracks(run, "A_1", definition="detector").extra
+    np.testing.assert_array_equal(heels.joints, places)
+    np.testing.assert_allclose(heels.covariance[:, 1, 0], np.tile(2e-4 * np.eye(3), (4, 1, 1)))
+    of_bodies = best_results.joint_tracks(run, "A_1").extra
+    np.testing.assert_array_equal(np.isnan(of_bodies.joints[0, :, 0, 0]), [False, True])
+
+
 def test_filled_joints_are_flagged(match_folder, tmp_path):
     run = origin(match_folder, **tracked())
     assert not [path for path in export(run, ["csv"], tmp_path / "a") if "origins" in path.parts]
