@@ -18,7 +18,12 @@ from data_contracts.match import MatchSpec
 from data_contracts.pin import Pin
 from data_contracts.release import BaselineSettings, ReleasedClip, ReleaseManifest
 from flows.results import best_results
-from flows.results.outputs import RELEASE, VIEWER_SUFFIX, record_owner, require_own, write_whole
+from flows.results.outputs import (
+    RELEASE,
+    VIEWER_SUFFIX,
+    own_whole,
+    write_whole,
+)
 from flows.results.run_cameras import (
     broadcast_views,
     estimated_pitch,
@@ -291,8 +296,6 @@ OF_CAMERAS = ("worldpose", "slahmr-cameras")
 """Formats that hold cameras without people; the second one of broadcast cameras alone."""
 CLASHING = {"worldpose", "challenge", "challenge-2025"}
 """Formats with the same file names; a folder can hold one of them."""
-SHARED = {manifests.FRAME_RATES, manifests.KINDS}
-"""Files to which exports of further clips are added."""
 COUNTED = {"joints", *CLASHING}
 """Formats that `check` and `statistics` read, and that lack the frame rate."""
 
@@ -336,10 +339,10 @@ def export(
     match_id = origin.spec.match_id
 
     def claim(folder: Path, drafts: Mapping[str, Path]) -> None:
-        require_own(folder, drafts, (match_id,), overwrite=overwrite)
-        record_owner(folder, drafts, match_id)
+        clips = best_results.all_clips(origin.run)
+        own_whole(folder, drafts, clips, (match_id,), overwrite=overwrite)
 
-    return write_whole(out, write, claim, SHARED)
+    return write_whole(out, write, claim)
 
 
 def forms_without_people(run: Run, spec: MatchSpec) -> tuple[str, ...]:
@@ -448,9 +451,10 @@ def release(
 
     def claim(folder: Path, drafts: Mapping[str, Path]) -> None:
         released = f"{RELEASE}{name} of {spec.match_id}"
-        require_own(folder, drafts, (released, spec.match_id), overwrite=False)
+        clips, owners = best_results.all_clips(origin.run), (released, spec.match_id)
+        own_whole(folder, drafts, clips, owners, overwrite=False, record=False)
 
-    return write_whole(out, lambda place: _write_release(origin, forms, place, ours), claim, SHARED)
+    return write_whole(out, lambda place: _write_release(origin, forms, place, ours), claim)
 
 
 def _write_release(

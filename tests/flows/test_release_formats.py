@@ -385,6 +385,27 @@ def test_heels_and_toes_without_a_body_are_those_of_triangulation(match_folder):
     np.testing.assert_array_equal(np.isnan(of_bodies.joints[0, :, 0, 0]), [False, True])
 
 
+def test_a_match_changes_no_frame_rate_of_another_matchs_files(match_folder, tmp_path):
+    run, out = origin(match_folder, **tracked()), tmp_path / "out"
+    rates = out / "frame_rates.json"
+
+    def other(**stated):
+        spec = run.spec.model_copy(update=stated)
+        return replace(run, registration=SimpleNamespace(spec=spec, folder=str(match_folder)))
+
+    export(run, ["joints"], out)
+    export(other(fps=25.0), ["joints"], out)  # corrected
+    assert json.loads(rates.read_text()) == {"A_1": 25.0}
+    with pytest.raises(InputError, match=r"A_1: expected 50.0, or no .* found 25.0, of m\."):
+        export(other(match_id="other"), ["worldpose"], out)
+    assert not (out / "poses").exists() and json.loads(rates.read_text()) == {"A_1": 25.0}
+    export(other(match_id="other", fps=25.0), ["worldpose"], out)  # of both
+    with pytest.raises(InputError, match=r"found 25.0, of m and other\."):
+        export(run, ["joints"], out)
+    export(run, ["joints"], out, overwrite=True)
+    assert json.loads(rates.read_text()) == {"A_1": 50.0}
+
+
 def test_filled_joints_are_flagged(match_folder, tmp_path):
     run = origin(match_folder, **tracked())
     assert not [path for path in export(run, ["csv"], tmp_path / "a") if "origins" in path.parts]
