@@ -47,7 +47,12 @@ from worldpose.geometry.cameras import Camera
 from worldpose.ingest.clock import remaining_offset
 from worldpose.ingest.footage import image_clock, unit_frames
 from worldpose.store.store import Run
-from worldpose.triangulation.camera_changes import describe_change, left_out_frames, move_on
+from worldpose.triangulation.camera_changes import (
+    changed_camera,
+    describe_change,
+    left_out_frames,
+    move_on,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -255,6 +260,10 @@ class ImageView:
         """Return pixels (frames, ..., 2) of the unchanged camera where the images show them."""
         return move_on(pixels, self.frame, self.camera, self.changes)
 
+    def camera_in(self, frame: int) -> Camera:
+        """Return a static camera as it is in a match frame."""
+        return changed_camera(self.camera, frame, self.changes)
+
     def project(self, points: Floats) -> Floats:
         """Return pixels (frames, ..., 2) of points (frames, ..., 3) [m] at the images' moments."""
         pixels = self.camera.project(points.reshape(len(points), -1, 3))
@@ -262,11 +271,15 @@ class ImageView:
 
 
 def image_views(
-    origin: best_results.Origin, clip: str, frames: NDArray[np.integer]
+    origin: best_results.Origin, clip: str, frames: NDArray[np.integer], *, corrected: bool = False
 ) -> Iterator[ImageView]:
-    """Yield the views of all cameras in consecutive match frames of a clip."""
+    """Yield the views of all cameras in consecutive match frames of a clip, static ones first.
+
+    With `corrected`, only changes count that the run corrects, so that what it leaves out is shown.
+    """
     frames = frames.astype(np.int64)
     changes = view_changes(origin.run, clip, origin.stage)
+    changes = [each for each in changes if each.is_explained or not corrected]
     for name, camera in origin.static_cameras.items():
         own = [each for each in changes if each.camera == name]
         unit = unit_frames(origin.spec, name)

@@ -17,10 +17,12 @@ from typer.testing import CliRunner
 
 from data_contracts.release import EXPORT_FORMATS, EXPORT_PURPOSES, BaselineSettings
 from flows.cli.app import app
+from flows.reports import clips
 from flows.results import best_results
 from flows.results.best_results import Origin
 from flows.results.data_set_release import _write_clip
 from flows.results.export import CLASHING, COUNTED, EXPORTS, export
+from flows.results.tool_exports import image_views
 from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import CHALLENGE15, HALPE26, fold_keypoints
 from worldpose.body.model import BodyParameters
@@ -179,6 +181,33 @@ def test_files_of_cameras_state_that_a_view_changes(match_folder, tmp_path):
     assert json.loads(written["camera_changes.json"].read_text())["A_1"][0]["frame"] == 102
     (scene,) = write("gltf", run, tmp_path)
     assert b"camera north moves at frame 102, by 30 px" in scene.read_bytes()
+
+
+@pytest.mark.parametrize("is_explained", [True, False])
+def test_the_report_compares_views_as_the_run_corrects_them(
+    match_folder, tmp_path, monkeypatch, is_explained
+):
+    change = {"frame": 102, "shift_px": (30.0, 0.0), "is_explained": is_explained}
+    results = static_rig(change | {"is_left_out": not is_explained})
+    results["body_fitting__A_1"]["joints"] *= 0.1  # into the image
+    index = np.tile(np.arange(2), (4, 1, 1))
+    tracking = results["tracking__A_1"]
+    tracking["detection_index"] = (("frame", "camera", "person"), index)
+    moved = origin(match_folder, **static_rig(change | {"is_explained": True}))
+    joints = results["body_fitting__A_1"]["joints"].values
+    (view,) = image_views(moved, "A_1", FRAMES)
+    seen = xr.Dataset(
+        {"keypoints": (("frame", "detection", "joint", "axis"), view.project(joints))},
+        coords={"frame": FRAMES},
+    )
+    shown = view.camera_in(102).project(joints[2].reshape(-1, 3)).reshape(2, 17, 2)
+    np.testing.assert_allclose(shown, seen["keypoints"][2], atol=1e-6)
+    assert np.isfinite(shown[0]).all()
+    monkeypatch.setattr(clips, "seen_in", lambda *_: "detection/north")
+    run = origin(match_folder, **results, detection__north=seen)
+    match = SimpleNamespace(registration=run.registration)
+    found = clips.worst_views(run.run, match, "A_1", best_results.joint_tracks(run.run, "A_1"))
+    assert [row for row, *_, percent in found if percent] == ([] if is_explained else [3, 3])
 
 
 def test_labels_of_a_stage_have_its_own_flags(match_folder, tmp_path, monkeypatch):
