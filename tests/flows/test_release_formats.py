@@ -210,6 +210,26 @@ def test_the_report_compares_views_as_the_run_corrects_them(
     assert [row for row, *_, percent in found if percent] == ([] if is_explained else [3, 3])
 
 
+def test_scenes_have_the_lens_of_every_frame_of_a_zoom(match_folder, tmp_path):
+    results = tracked()
+    results["broadcast_calibration__A_1"]["distortion"][:, 0] = [-0.01, -0.02, -0.08, -0.15]
+    run = origin(match_folder, **results)
+    (path,) = write("gltf", run, tmp_path)
+    content = path.read_bytes()
+    nodes = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])["nodes"]
+    (about,) = (node["extras"] for node in nodes if "camera" in node)
+    lenses = about["distortion_k1_k2_p1_p2_k3_by_frame"]
+    # The camera is known from frame 99 to 102, the bodies from 100 to 103.
+    assert [lens and lens[0] for lens in lenses] == [-0.02, -0.08, -0.15, None]
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    from pxr import Usd
+
+    (path,) = write("usd", run, tmp_path)
+    stage = Usd.Stage.Open(str(path))
+    lens = stage.GetAttributeAtPath("/world/broadcast.distortion_k1_k2_p1_p2_k3")
+    assert [lens.Get(frame)[0] for frame in lens.GetTimeSamples()] == [-0.02, -0.08, -0.15]
+
+
 def test_labels_of_a_stage_have_its_own_flags(match_folder, tmp_path, monkeypatch):
     results = static_rig(inliers=False)
     results["body_fitting__A_1"]["joints"] *= 0.1  # into the image
