@@ -271,13 +271,13 @@ class ImageView:
 
 
 def image_views(
-    origin: best_results.Origin, clip: str, frames: NDArray[np.integer], *, corrected: bool = False
+    origin: best_results.Origin, clip: str, frame: NDArray[np.integer], *, corrected: bool = False
 ) -> Iterator[ImageView]:
     """Yield the views of all cameras in consecutive match frames of a clip, static ones first.
 
     With `corrected`, only changes count that the run corrects, so that what it leaves out is shown.
     """
-    frames = frames.astype(np.int64)
+    frames = frame.astype(np.int64)
     changes = view_changes(origin.run, clip, origin.stage)
     changes = [each for each in changes if each.is_explained or not corrected]
     for name, camera in origin.static_cameras.items():
