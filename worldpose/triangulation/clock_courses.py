@@ -67,7 +67,7 @@ def trace_clocks(
         sums = replace(add_up(bins=(max(1, round(0.2 * fps)), 1)), are_clocks_asked=True)
         if not len(sums.rows):
             break
-        fitted = fit_parts(sums, place_steps(parts, frames, fps, add_up), frames, ("clock",))
+        fitted = fit_parts(sums, place_steps(parts, frames, round(fps), add_up), frames, ("clock",))
         if len(fitted) == len(parts) == count or is_settled(parts, fitted):
             break
         # A common offset changes no residual: most clocks keep theirs.

@@ -168,6 +168,18 @@ def test_the_changed_camera_is_named_and_measured(cameras, spoil, row, amount):
         assert found.amount[4] == pytest.approx(amount, abs=0.25)
 
 
+def test_all_frames_tell_when_a_view_steps_between_sampled_ones(cameras):
+    people = view(
+        cameras, lambda pixels, frame, camera: turn(camera, pixels, frame >= 131, 30.0, 9.0)
+    )
+    rows = np.arange(0, FRAMES, 8)
+    sums = sum_clip(cameras, people, FPS / 8, rows, settings=SETTINGS)
+    (found,) = find_changes(cameras, people, FPS / 8, rows, sums, ("view",))
+    assert found.camera == BAD
+    assert found.row == 131
+    np.testing.assert_allclose(found.amount[:2], [30.0, 9.0], atol=0.6)
+
+
 def skip(pixels, *_):
     """The recorder lost 9 frames after frame 99."""
     return np.concatenate([pixels[:100], pixels[109:]])
