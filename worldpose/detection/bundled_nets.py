@@ -334,7 +334,9 @@ def decode_candidates(maps: Tensor, count: int) -> tuple[Tensor, Tensor]:
     least = high.amax(dim=(1, 2), keepdim=True).clamp(max=min_mass / 25.0)
     index, row, column = torch.nonzero(high >= least, as_tuple=True)
     step = torch.arange(-3, 4, device=maps.device)
-    best = _around(chance, (index, 4 * row, 4 * column), step[3:]).flatten(1).max(dim=1)
+    first = (4 * index * high.shape[1] + 4 * row) * high.shape[2] + column
+    four = first[:, None] + high.shape[2] * step[3:]  # the block's rows of four cells
+    best = chance.view(-1, 4).index_select(0, four.flatten()).view(-1, 16).max(dim=1)
     row, column = 4 * row + best.indices // 4, 4 * column + best.indices % 4
     high = best.values
     for reach in (1, 3):  # most of these cells have a higher direct neighbour

@@ -214,9 +214,9 @@ def find_groups(people: People, shape: tuple[int, ...]) -> list[Part]:
     boxes = sure.boxes[sure.scores >= MIN_GROUP_SCORE]
     # Neighbours in a group overlap more [1, intersection over union].
     near = (box_iou(boxes, boxes) > 0.15) | np.eye(len(boxes), dtype=np.bool_)
-    member, before = np.arange(len(boxes)), None
-    while not np.array_equal(member, before):  # each takes the first number around
-        before, member = member, np.where(near, member, len(near)).min(axis=1, initial=len(near))
+    member, before = np.arange(len(boxes)), np.empty(0, dtype=np.int64)
+    while len(boxes) and not np.array_equal(member, before):  # each takes the first number around
+        before, member = member, np.where(near, member, len(near)).min(axis=1)
     counts = np.bincount(member)
     boxes = boxes[np.lexsort((boxes[:, 3] - boxes[:, 1], member))]
     grouped = np.repeat(counts > 1, counts)

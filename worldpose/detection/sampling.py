@@ -102,8 +102,8 @@ def pad(views: Sequence[View], shape: Sequence[int]) -> Tensor:
     if isinstance(first := views[0][0], Tensor):
         padded = first.new_full(whole, OUTSIDE)
         for canvas, view in zip(padded, views, strict=True):
-            image = torch.as_tensor(resize(view))
-            canvas[:, : image.shape[0], : image.shape[1]] = image.permute(2, 0, 1)
+            seen = torch.as_tensor(resize(view))
+            canvas[:, : seen.shape[0], : seen.shape[1]] = seen.permute(2, 0, 1)
         return padded
     batch = borrow("planes", whole)
     for planes, view in zip(batch, views, strict=True):
