@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 from unittest.mock import patch
 
-import cv2
 import numpy as np
 import psutil
 import torch
@@ -84,7 +83,6 @@ def measure_detection(options: Namespace) -> Tables:
     one is of the stage without video: its nets answer with what they returned the first time, so
     that the time is that of the work between them.
     """
-    cv2.setNumThreads(1)
     torch.set_num_threads(1)
     rendering, pictures, camera, pitch = render_crowd(options.people, options.frames)
     decoding = time_decoding(pictures)
