@@ -25,7 +25,6 @@ from worldpose.formats.calibration_files import (
     MODEL_NAMES,
     calibration_error,
     camera_tables,
-    is_fisheye,
     plain_key,
     read_optics,
     require_optics,
@@ -111,13 +110,9 @@ def read_lenses(
         "size": list(own or sizes[camera]),
         "matrix": (matrix.reshape(3, 3) if matrix.shape == (9,) else matrix).tolist(),
         "distortions": distortion.tolist(),
-        "fisheye": is_fisheye(where, given),
+        **{key: value for key, value in given.items() if plain_key(key) in MODEL_NAMES},
     }
-    lens = _lens(where, camera, table, sizes[camera])
-    if own is None:
-        todo = "Add the calibrated images' size to the file: image_size = [WIDTH, HEIGHT]."
-        require_middle(where, lens.principal_point_px, sizes[camera], todo)
-    return {camera: lens}
+    return {camera: _lens(where, camera, table, sizes[camera], has_size=own is not None)}
 
 
 def read_lens_toml(
@@ -414,7 +409,12 @@ def _image_size(given: Mapping[str, Any]) -> tuple[int, int] | None:
 
 
 def _lens(
-    where: str, name: str, table: Mapping[str, Any], size: tuple[int, int]
+    where: str,
+    name: str,
+    table: Mapping[str, Any],
+    size: tuple[int, int],
+    *,
+    has_size: bool = True,
 ) -> LensCalibration:
     """Return the lens of a table at the size of the camera's images."""
     # The same of the image corner's displacement, relative to its distance from the centre
@@ -453,6 +453,9 @@ def _lens(
         raise calibration_error(
             f"{where}.{entry}", str(first["msg"]), str(first["input"])
         ) from error
+    if not has_size:
+        todo = "Add the calibrated images' size to the file: image_size = [WIDTH, HEIGHT]."
+        require_middle(where, lens.principal_point_px, size, todo)
     from worldpose.geometry.cameras import Camera  # late: it loads the kernels
 
     Camera.from_lens(lens).require_rays(where)

@@ -113,7 +113,7 @@ def _read_matrix(where: str, table: dict[str, Any]) -> NDArray[np.float64]:
     # Length of the text before base64 data, which repeats the type [byte].
     header_bytes = 24
     try:
-        kind = re.fullmatch(r"(\d{0,3})([ucwsifd])", str(table["dt"]))
+        kind = re.fullmatch(r"(\d{0,3})([ucwsifd])", str(table.get("dt", "d")))  # ROS has none
         if kind is None:
             raise ValueError(f"the type {table['dt']!r:.20}")
         sizes = table["sizes"] if "sizes" in table else [table["rows"], table["cols"]]
