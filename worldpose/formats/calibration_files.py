@@ -190,10 +190,14 @@ def index_by_name(
 
 
 def require_poses(path: Path, cameras: Mapping[str, CameraCalibration]) -> None:
-    """Raise InputError if several cameras are all in one place."""
+    """Raise InputError if several cameras are all in one place, or the only one has no pose."""
     centers = np.array([-np.array(each.rotation).T @ each.translation for each in cameras.values()])
-    if len(cameras) > 1 and np.ptp(centers, axis=0).max() <= 1e-6 * np.abs(centers).max():
-        found = "all cameras in one place: a calibration before the poses were found"
+    is_lens = all(np.array_equal(each.rotation, np.eye(3)) for each in cameras.values())
+    at_one = np.ptp(centers, axis=0).max() <= 1e-6 * np.abs(centers).max()
+    # The only camera of a chain is where the chain begins.
+    if at_one and (len(cameras) > 1 or (is_lens and not centers.any())):
+        found = "all cameras in one place" if len(cameras) > 1 else "one camera, at the origin"
+        found += ": a calibration before the poses were found"
         todo = (
             "Import its lenses with worldpose import --lens FILE --out MATCH, and locate the "
             "cameras by clicks or by worldpose locate-cameras."
@@ -386,7 +390,8 @@ def _read_lens(
     """Return coefficients in OpenCV's order, and their model; OpenCV writes up to 14 numbers."""
     # Maximum p1 and p2 [1]; real lenses have 0.005, webcams up to 0.02. Four numbers name no k3.
     # Poor calibrations reach 0.07: their k3 is larger than what another order has in its place.
-    is_sure = is_named or bool(np.abs(numbers[4:5]).max(initial=0.0) > np.abs(numbers[2:4]).max())
+    k3, p = (np.abs(each).max(initial=0.0) for each in (numbers[4:5], numbers[2:4]))
+    is_sure = is_named or k3 > p
     max_tangential = 0.1 if is_sure else 0.01 if len(numbers) == 4 else 0.025
     is_rational = not fisheye and bool(np.any(numbers[5:8] != 0))
     model: LensName = "fisheye" if fisheye else "rational" if is_rational else "brown"
@@ -397,7 +402,7 @@ def _read_lens(
             "k1 k2 k3 k4 of a fisheye" if fisheye else "k1 k2 p1 p2, with k3, or with k3 k4 k5 k6",
             f"{len(numbers)} numbers{', a lens model with more terms' * (len(numbers) > 5)}",
         )
-    if not fisheye and np.abs(numbers[2:4]).max() > max_tangential:
+    if not fisheye and p > max_tangential:
         expected = f"k1 k2 p1 p2 k3 with p1 and p2 up to {max_tangential:g}"
         todo = (
             "If this is k1 k2 k3 k4 of a fisheye, say so in the file: fisheye = true in TOML, "

@@ -49,7 +49,7 @@ DISTORTION_NAMES: Final = (
     *("distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoefs", "distcoeff"),
     *("distcoef", "dist", "cameradist", "distortions", "distortion", "D", "d"),
 )
-_OWNERS: Final = ("image", "img", "frame", "video", "picture", "calibration")
+_OWNERS: Final = ("image", "img", "frame", "video", "picture", "calibration", "camera", "cam")
 SIZE_NAMES: Final = (
     *((f"{owner}width", f"{owner}height") for owner in ("", *_OWNERS)),
     *(("size",), ("resolution",), ("dim",)),
@@ -287,12 +287,11 @@ def kalibr_tables(
         expected = "a camchain of Kalibr, or EasyMocap's intri.yml and extri.yml"
         raise calibration_error(str(path), expected, f"{content!r:.60}")
     pose: NDArray[np.float64] | None = np.eye(4)
-    tables = {str(name): given for name, given in content.items()}
+    tables = {str(name): given for name, given in content.items() if isinstance(given, dict)}
     if all(re.fullmatch(r"cam\d+", name) for name in tables):
         tables = by_last_number(tables)  # Kalibr writes cam0, cam1, cam10, cam2
     for index, (name, given) in enumerate(tables.items()):
         where = f"{path}: {name}"
-        given = given if isinstance(given, dict) else {}
         model, lens = given.get("camera_model"), given.get("distortion_model", "none")
         if model != "pinhole" or lens not in ("radtan", "equidistant", "none"):
             expected = "camera_model pinhole with distortion_model radtan, equidistant or none"
@@ -331,9 +330,9 @@ def _chain(
         matrix = np.array(step, np.float64)
     except (TypeError, ValueError):
         matrix = np.empty(0)
-    if matrix.shape != (4, 4):
+    if matrix.shape not in ((4, 4), (16,)):
         raise calibration_error(where, "numbers of shape (4, 4)", f"{step!r:.60}")
-    return matrix @ pose
+    return matrix.reshape(4, 4) @ pose
 
 
 def _read_mapping(file: Path) -> dict[str, Any]:

@@ -25,8 +25,7 @@ _TOKEN: Final = re.compile(r'"[^"]*"|[^\s"]+')
 
 def is_storage(file: Path) -> bool:
     """Return whether a YAML or JSON file is one of OpenCV's FileStorage."""
-    text = read_text(file, SETTINGS_BYTES)
-    return "%YAML:" in text[:64] or "opencv-matrix" in text
+    return "opencv-matrix" in read_text(file, SETTINGS_BYTES)
 
 
 def read_file_storage(file: Path) -> dict[str, Any]:
@@ -51,9 +50,7 @@ def read_file_storage(file: Path) -> dict[str, Any]:
         text = re.sub(r"(?<=\d\.)(?=[\s,\]}])", "0", text)  # OpenCV writes 1. and .Nan
         content = parse_json(where, re.sub(r"\.(Nan|Inf)\b", lambda it: words[it[1]], text))
     else:
-        head, _, rest = text.partition("\n")
-        plain = rest if head.startswith("%YAML") else text
-        content = parse_yaml(where, plain.replace("!!opencv-", "!!map #"))
+        content = parse_yaml(where, text.replace("!!opencv-", "!!map #"))
     if not isinstance(content, dict):
         raise calibration_error(where, expected, type(content).__name__)
     found = {str(name): _read_value(f"{where}: {name}", each) for name, each in content.items()}

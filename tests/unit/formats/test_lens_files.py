@@ -143,6 +143,7 @@ def test_json_with_several_cameras_gives_their_lenses_by_name(form, tmp_path):
         {"resolution": "3840x2160"},
         {"img_size": "[3840, 2160]"},
         {"DIM": [3840, 2160]},
+        {"cameraResolution": [3840, 2160]},
         {"resolution": "4K UHD 3840x2160@30"},
         {"frame_size": [3840, 2160], "size": 25.0},
     ],
