@@ -275,7 +275,7 @@ def _categories(path: Path, limit: int) -> _Categories:
     lists = [each.get("keypoints") for each in given]
     names = [tuple(map(str, each)) if isinstance(each, list) else () for each in lists]
     of: dict[tuple[str, ...], list[dict[str, Any]]] = {}
-    balls = []
+    balls: list[dict[str, Any]] = []
     for own, each in zip(names, given, strict=True):
         is_ball = "ball" in re.split(r"[^a-z]+", str(each.get("name")).lower())
         (balls if is_ball else of.setdefault(own, [])).append(each)
