@@ -32,7 +32,6 @@ from worldpose.formats.files import read_toml
 NUMBER_LIMIT: Final = 1e9
 """Maximum absolute value of any entry, whatever its unit."""
 
-
 ROTATION_TOLERANCE: Final = 1e-4
 """Maximum rounding error of R R^T = I [1]; four decimals give less."""
 
@@ -194,7 +193,6 @@ def require_poses(path: Path, cameras: Mapping[str, CameraCalibration]) -> None:
     centers = np.array([-np.array(each.rotation).T @ each.translation for each in cameras.values()])
     is_lens = all(np.array_equal(each.rotation, np.eye(3)) for each in cameras.values())
     at_one = np.ptp(centers, axis=0).max() <= 1e-6 * np.abs(centers).max()
-    # The only camera of a chain is where the chain begins.
     if at_one and (len(cameras) > 1 or (is_lens and not centers.any())):
         found = "all cameras in one place" if len(cameras) > 1 else "one camera, at the origin"
         found += ": a calibration before the poses were found"
@@ -318,11 +316,9 @@ def read_optics(where: str, table: Mapping[str, Any], keys: Keys = Keys()) -> Op
     """
     matrix = _read_numbers(table, where, keys.matrix, (3, 3))
     size = _read_numbers(table, where, keys.size, (2,))
-    fisheye, is_named = read_model(where, table)
     numbers = np.ravel(_read_numbers(table, where, keys.distortions, None))
-    distortion, model = _read_lens(
-        f"{where}.{keys.distortions}", numbers, fisheye=fisheye, is_named=is_named
-    )
+    said = read_model(where, table)
+    distortion, model = _read_lens(f"{where}.{keys.distortions}", numbers, *said)
     off_diagonal = [matrix[0, 1], matrix[1, 0], *matrix[2, :2], matrix[2, 2] - 1]
     if np.any(np.abs(off_diagonal) > 1e-9):
         raise calibration_error(
@@ -385,14 +381,13 @@ def read_model(where: str, given: Mapping[str, Any]) -> tuple[bool, bool]:
 
 
 def _read_lens(
-    where: str, numbers: NDArray[np.float64], *, fisheye: bool, is_named: bool
+    where: str, numbers: NDArray[np.float64], fisheye: bool, is_named: bool
 ) -> tuple[NDArray[np.float64], LensName]:
     """Return coefficients in OpenCV's order, and their model; OpenCV writes up to 14 numbers."""
     # Maximum p1 and p2 [1]; real lenses have 0.005, webcams up to 0.02. Four numbers name no k3.
     # Poor calibrations reach 0.07: their k3 is larger than what another order has in its place.
     k3, p = (np.abs(each).max(initial=0.0) for each in (numbers[4:5], numbers[2:4]))
-    is_sure = is_named or k3 > p
-    max_tangential = 0.1 if is_sure else 0.01 if len(numbers) == 4 else 0.025
+    max_tangential = 0.1 if is_named or k3 > p else 0.01 if len(numbers) == 4 else 0.025
     is_rational = not fisheye and bool(np.any(numbers[5:8] != 0))
     model: LensName = "fisheye" if fisheye else "rational" if is_rational else "brown"
     names = COEFFICIENTS[model]
