@@ -143,6 +143,7 @@ def test_json_with_several_cameras_gives_their_lenses_by_name(form, tmp_path):
         {"resolution": "3840x2160"},
         {"img_size": "[3840, 2160]"},
         {"DIM": [3840, 2160]},
+        {"cameraResolution": [3840, 2160]},
         {"resolution": "4K UHD 3840x2160@30"},
         {"frame_size": [3840, 2160], "size": 25.0},
     ],
@@ -185,6 +186,50 @@ def test_five_numbers_in_another_order_are_refused(tmp_path, lens):
             read_lenses([file], "left", SIZES)
     file.write_text(json.dumps({"K": MATRIX.tolist(), "dist": [-0.3, 0.1, 0.012, 0.0, 0.0]}))
     assert read_lenses([file], "left", SIZES)["left"].distortion[2] == 0.012
+
+
+@pytest.mark.parametrize(
+    ("lens", "said"),
+    [
+        ([0.1, -0.05, -0.04, 0.03, 0.0], {"distortion_model": "plumb_bob"}),
+        ([0.05, -0.1, 0.03, -0.03, 0.0], {"distortion_model": "radtan"}),
+        ([0.0, -0.18, 0.033, -0.005, 0.18], {}),
+    ],
+)
+def test_large_tangential_terms_count_where_no_other_order_explains_them(tmp_path, lens, said):
+    file = tmp_path / "lens.json"
+    file.write_text(json.dumps({"K": MATRIX.tolist(), "dist": lens, **said}))
+    assert read_lenses([file], "left", SIZES)["left"].distortion == tuple(lens)
+    file.write_text(
+        json.dumps({"K": MATRIX.tolist(), "dist": [*lens[:2], 0.11, *lens[3:]], **said})
+    )
+    with pytest.raises(InputError, match=r"p1 and p2 up to"):
+        read_lenses([file], "left", SIZES)
+
+
+def test_tabs_and_matrices_without_a_type_are_read_as_opencv_and_ros_do(tmp_path):
+    text = (
+        "%YAML:1.0\nimage_width: 1920\nimage_height: 1080\ncamera_matrix: !!opencv-matrix\n"
+        "   rows: 3\n   cols: 3\n   dt: d\n"
+        "   data: [ 1400., 0., 970., 0., 1404., 530., 0., 0., 1. ]\n"
+        "distortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 5\n   dt: d\n"
+        "   data: [ -0.1, 0., 0., 0., 0. ]\n"
+        "rectification_matrix:\n   rows: 1\n   cols: 1\n   data: [ 1.0 ]\n"
+    )
+    (tmp_path / "lens.yml").write_text(text)
+    lens = read_lenses([tmp_path / "lens.yml"], "left", SIZES)["left"]
+    assert (lens.focal_px, lens.distortion) == (1402.0, (-0.1, 0.0, 0.0, 0.0, 0.0))
+    (tmp_path / "ros.yaml").write_text(
+        "K: [1400, 0, 970, 0, 1404, 530, 0, 0, 1]\t\nD: [0, 0, 0, 0]\t# px\n"
+    )
+    assert read_lenses([tmp_path / "ros.yaml"], "left", SIZES)["left"].focal_px == 1402.0
+
+
+def test_a_lens_of_another_image_size_is_told_by_its_middle_before_its_folds(tmp_path):
+    lens = {"K": [[490, 0, 330], [0, 490, 230], [0, 0, 1]], "dist": [-0.36, 0.16, 0, 0, -0.04]}
+    (tmp_path / "lens.json").write_text(json.dumps(lens))
+    with pytest.raises(InputError, match="the middle of about 661 x 461 px"):
+        read_lenses([tmp_path / "lens.json"], "left", SIZES)
 
 
 LENS = {"camera_matrix": MATRIX.tolist(), "dist": DISTORTION[0].tolist()}
