@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import reduce
 from operator import add
 from typing import Any, Final
@@ -213,12 +212,11 @@ def _find_changes(
     known = known_changes(inputs, inputs.unit)
     found = find_changes(clip.cameras, clip.detections, sums.fps, rows, sums, kinds)
     if found and len(names) < 3:
-        warnings.append(_describe_pair(names, found[0], frame[rows]))
+        warnings.append(_describe_pair(names, found[0], frame))
         return known
     new = list[CameraChange]()
     for measured in found:
-        row = None if measured.row is None else int(rows[measured.row])
-        change = change_record(replace(measured, row=row), names[measured.camera], frame)
+        change = change_record(measured, names[measured.camera], frame)
         if is_by_chance(change):  # told, not taken back
             change = change.model_copy(update={"is_explained": False})
         if not any(is_same_change(one, change, clip.fps) for one in known):

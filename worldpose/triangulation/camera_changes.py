@@ -88,7 +88,7 @@ def find_changes(
         cameras: batch (cameras,).
         people: detections of the tracked people of a clip.
         fps: rows per second [1/s].
-        rows: the rows of the clip that `sums` count.
+        rows: the rows of the clip that `sums` count, evenly apart.
         sums: equations of the people as triangulated.
         kinds: what may change.
     """
@@ -99,9 +99,18 @@ def find_changes(
         free, is_left_out = swaying
         parts, after = _fit_clip(cameras, people, fps, rows, sums, kinds, free)
     shifting = [part for part in parts if part.shape != "constant"]
+    stds = spreads(after, shifting, frames)
+    # Where rows are sampled, all frames between two tell at which a view steps.
+    whole = [replace(part, row=int(rows[part.row])) for part in parts]
+    stride = int(np.diff(rows).max(initial=1))
+    if stride > 1:
+        frames, fps = len(people.detection_index), fps * stride
+        add_up = partial(sum_clip, cameras, people, fps, np.arange(frames), whole)
+        whole = place_steps(whole, frames, stride, add_up)
+    shifting = [part for part in whole if part.shape != "constant"]
     found = [
         _measure(part, std, cameras[part.camera], frames)
-        for part, std in zip(shifting, spreads(after, shifting, frames), strict=True)
+        for part, std in zip(shifting, stds, strict=True)
     ]
     if free is not None:
         unknown = MeasuredChange(free, "view", None, np.zeros(WIDTH), is_explained=False)
@@ -127,7 +136,7 @@ def _fit_clip(
     for _ in range(12):
         sums = sums if free is None else sums.without_camera(free)
         add_up = partial(sum_clip, cameras, people, fps, rows)
-        placed = place_steps(parts, len(rows), fps, partial(add_up, parts))
+        placed = place_steps(parts, len(rows), round(fps), partial(add_up, parts))
         fitted = on_common_clock(fit_parts(sums, placed, len(rows), kinds))
         names = [part.name for part in fitted]
         # What comes and goes is hardly clear.
@@ -212,16 +221,16 @@ def sum_clip(
 
 
 def place_steps(
-    parts: Sequence[Part], frames: int, fps: float, add_up: Callable[..., ChangeSums]
+    parts: Sequence[Part], frames: int, near: int, add_up: Callable[..., ChangeSums]
 ) -> list[Part]:
-    """Return parts with each step at the row that the rows around it show.
+    """Return parts with each step at the row that `near` rows on both sides of it show.
 
     Along the step's size d, the residuals of a row t have the amplitude a_t with weight h_t: 0
     before the step and 1 from it on, with a constant m. Among rows k, the expected one by
     exp(-sum_t h_t (a_t - [t >= k] - m)^2 / (2 noise)) is chosen. `add_up` is `sum_clip` for people
     with the parts taken back.
     """
-    near, placed = round(1.0 * fps), list(parts)
+    placed = list(parts)
     for number, part in enumerate(parts):
         if part.shape != "step":
             continue
