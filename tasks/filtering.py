@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -22,6 +22,7 @@ from tasks.clip_inputs import (
     ADJUSTED,
     ClipInputs,
     PagedArray,
+    known_changes,
     load_dropped_boxes,
     open_tracked_clip,
     triangulation_settings,
@@ -65,12 +66,10 @@ from worldpose.geometry.cameras import Camera, camera_from_arrays
 from worldpose.ingest.clock import remaining_offset
 from worldpose.review.identities import select_triangulated
 from worldpose.store.writer import ResultWriter
+from worldpose.triangulation.camera_changes import correct_views, move_on
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.video.folder import open_video, some_pictures
 
-FEW: Final = 500
-"""Minimum number of keypoints to estimate a camera's spread; below it the stated one is used
-[1]."""
 PART = 64
 """Frames per part: 100 MB with 25 people and 16 cameras, for each of up to five at a time."""
 PLACED = ("offsets", "exchanged")
@@ -332,7 +331,7 @@ class _CameraCase:
         detection: what the detections were computed from.
         detected: the people of `detection` (frames, detections).
         person: (persons,) ids.
-        expected: the bodies in the camera's images.
+        expected: the bodies in the camera's images, which follow its changes; NaN if left out.
         shift: (frames, persons, 17, 2) [px], systematic error of keypoints relative to joints.
         seen: (frames, persons), detected people; all people in corrected frames.
         spread: spread of the camera's keypoints around the bodies.
@@ -387,8 +386,8 @@ def _open_view(inputs: UnitInputs) -> _CameraCase:
     motion = watch_motion(one, joints, step)
     shift = systematic.shift(motion, views)
     offsets = placed["offsets"].values.astype(np.float64)
-    clocks = inputs.made_from(f"tracking/{clip}").sources.get("clocks")
-    late = np.zeros(1) if clocks is None else remaining_offset(detected.frame, *clocks[place])
+    clocks, frame = inputs.made_from(f"tracking/{clip}").sources.get("clocks"), detected.frame
+    late = np.zeros(1) if clocks is None else remaining_offset(frame, *clocks[place])
     in_image = shift + late[:, None, None, None, None] * motion.image_motion
     beside = in_image[:, 0] + offsets[:, 0, :, None]
 
@@ -396,12 +395,13 @@ def _open_view(inputs: UnitInputs) -> _CameraCase:
     index = tracks["detection_index"].values[:, place]
     fits, dropped = (said[name].values[:, place, :count] for name in ("fits", "dropped"))
     seen = find_detected_people(index, fits, dropped)
-    edits = detection.sources.get("edits", [])
-    seen[np.isin(detected.frame, [edit["frame"] for edit in edits])] = True
+    seen[np.isin(frame, [edit["frame"] for edit in detection.sources.get("edits", [])])] = True
     noise = triangulation_settings(inputs, clip).noise
+    known = known_changes(inputs, clip)
+    changes = [each for each in known if (each.camera, each.kind) == (name, "view")]
     suspects = TriangulatedDetections(
         KeypointDetections.from_keypoints(
-            detected.keypoints[:, None].astype(np.float64),
+            correct_views(detected.keypoints[:, None], frame, {name: camera}, changes),
             detected.confidence[:, None].astype(np.float64),
             np.where(index < count, index, -1)[:, None],
         ),
@@ -410,13 +410,14 @@ def _open_view(inputs: UnitInputs) -> _CameraCase:
         dropped[:, None],
         noise,
     )
+    expected = Expected.of(views, beside, float(camera.focal.mean()))
     return _CameraCase(
         camera=camera,
         surface=adjusted.attrs["surface"],
         detection=detection,
         detected=detected,
         person=tracks["person"].values,
-        expected=Expected.of(views, beside, float(camera.focal.mean())),
+        expected=replace(expected, image=move_on(expected.image, frame, camera, changes)),
         shift=np.nan_to_num(shift[:, 0]),
         seen=seen,
         spread=_spread(views, suspects.subtract(in_image)),
@@ -426,7 +427,8 @@ def _open_view(inputs: UnitInputs) -> _CameraCase:
 
 def _spread(views: BodyViews, suspects: TriangulatedDetections) -> Spread:
     """Estimate the keypoint spread around bodies; the stated one if there are too few keypoints."""
-    if np.count_nonzero(suspects.detections.detection_index >= 0) * len(COCO17) < FEW:
+    few = 500  # keypoints
+    if np.count_nonzero(suspects.detections.detection_index >= 0) * len(COCO17) < few:
         return Spread(np.ones(len(COCO17)), np.empty(0), np.ones(1))
     return learn_keypoint_spread(views, suspects)
 
@@ -471,7 +473,6 @@ def _arrays(
     case: _CameraCase, sought: MissingPeople, results: KeypointDetections, verdicts: Verdicts
 ) -> dict[str, NDArray[Any]]:
     """Return all detections at their indices, followed by the redetected people."""
-    before = case.detected.arrays()
     frames, count = case.detected.score.shape
     (found,) = np.nonzero(verdicts.found)
     frame = sought.frame[found]
@@ -483,7 +484,7 @@ def _arrays(
             [(0, 0), (0, more)] + [(0, 0)] * (values.ndim - 2),
             constant_values=np.nan,
         )
-        for name, values in before.items()
+        for name, values in case.detected.arrays().items()
     }
     shape = (frames, count + more)
     arrays["found_again"] = np.full(shape, -1, dtype=np.int32)

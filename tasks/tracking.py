@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -52,7 +52,7 @@ from worldpose.triangulation.camera_changes import (
     is_same_change,
     refine_change,
 )
-from worldpose.triangulation.lost_views import find_lost_views
+from worldpose.triangulation.lost_views import find_lone_views, find_lost_views
 from worldpose.triangulation.world import People, doubt_world
 
 BLOCK: Final = 256
@@ -189,8 +189,23 @@ def _track_people(inputs: UnitInputs) -> Tracked:
         elif found.on_plane.any():
             figures |= {name: number for name, number in further.items() if "plane" in name}
     more, doubts = _doubts(inputs, clip, tracks)
-    moved = [f"{describe_change(change)}." for change in changes]
+    moved = _describe_changes(clip, tracks, changes)
     return found, figures | more, (*filter(None, [said]), *doubts, *moved)
+
+
+def _describe_changes(
+    clip: ClipInputs, tracks: Tracking, changes: Sequence[CameraChange]
+) -> list[str]:
+    """Return sentences about cameras that change, and others that meet nobody from a frame on."""
+    lone = find_lone_views(clip.cameras, clip.detections, tracks.joints, clip.fps)
+    explained = {change.camera for change in changes}
+    return [f"{describe_change(change)}." for change in changes] + [
+        f"camera {clip.camera_ids[c]}: from frame {clip.detections.frame[row]} on its people meet "
+        "nobody, though other cameras place people in its view. Look whether it moved, or its "
+        "clock changed."
+        for c, row in lone.items()
+        if clip.camera_ids[c] not in explained
+    ]
 
 
 def _doubts(

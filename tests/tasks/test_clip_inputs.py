@@ -17,6 +17,7 @@ from worldpose.body.body_file import find_body
 from worldpose.body_fitting.monocular import MonocularEstimates
 from worldpose.body_fitting.pose_space import GATHER
 from worldpose.detection.interfaces import ScoreMap
+from worldpose.detection.settings import RedetectionSettings
 from worldpose.filtering.redetection import MissingPeople
 from worldpose.filtering.systematic_errors import TERMS
 from worldpose.geometry.cameras import Camera, camera_arrays
@@ -185,7 +186,8 @@ def test_two_frames_that_show_one_image_are_both_searched(monkeypatch):
     assert shown == dict(enumerate(numbers.tolist()))
 
 
-def test_people_are_looked_for_where_the_image_shows_them(late_clips):
+@pytest.mark.parametrize("is_explained", [True, False])
+def test_people_are_looked_for_where_the_image_shows_them(late_clips, monkeypatch, is_explained):
     frame, eye = np.arange(10), look_at_camera((0.0, -20.0, 5.0), (0.0, 0.0, 0.0), 1500.0)
     height = np.linspace(1.8, 0.1, 17)
 
@@ -226,13 +228,30 @@ def test_people_are_looked_for_where_the_image_shows_them(late_clips):
         ),
     }
     late_clips["tracking/a"] = late_clips["tracking/a"].assign_coords(camera=["cam"])
+    # The camera turns before frame 6, or nothing explains its views.
+    given = {"first_frame": 0, "frame_count": 10, "shift_px": (30.0, 0.0), "std": 0.1}
+    given |= {"is_explained": is_explained, "is_left_out": not is_explained}
+    change = CameraChange(camera="cam", kind="view", frame=6, **given)
+    late_clips["triangulation/a"] = SimpleNamespace(attrs={"changes": [change.model_dump()]})
+    late_clips["s/a"]["keypoints"] += eye.principal_point
+    late_clips["s/a"]["keypoints"][6:] += np.array([30.0, 0.0])
+    taken = []
+    monkeypatch.setattr(filtering, "_spread", lambda _, suspects: taken.append(suspects))
     late_clips.unit = "s"
     late_clips.sources |= {"camera": "cam", "clip": "a"}
-    settings = SimpleNamespace(settings=lambda kind: kind(), sources=late_clips.sources)
+    settings = SimpleNamespace(settings=lambda kind: kind(), sources=late_clips.sources, pitch=None)
     late_clips.made_from = lambda name: settings
     case = filtering._open_view(late_clips)
+    if not is_explained:
+        assert np.isnan(case.expected.image).all()
+        assert not len(case.select_missing_people(RedetectionSettings()).frame)
+        return
     shown = eye.project(body(frame[1:-1] - 0.25).reshape(-1, 3)).reshape(8, 17, 2)
-    np.testing.assert_allclose(case.expected.image[1:-1, 0], shown, atol=0.05)
+    shown[5:, :, 0] += 30.0
+    np.testing.assert_allclose(case.expected.image[1:-1, 0], shown, atol=0.3)
+    (suspects,) = taken
+    step = np.diff(suspects.detections.keypoints[1:-1, 0, 0, 0, 0])
+    np.testing.assert_allclose(step, 8.0, atol=0.5)
     assert np.abs(case.shift[1:-1]).max() == 0.0  # tracking moves what is found to match time
 
 

@@ -12,7 +12,8 @@ class TrackingSettings(Record):
     """Gates, counts and times. The paper gives no values; these suit people in metres."""
 
     causal: bool = False
-    """Identities in a frame depend on it and earlier frames only; else on the whole clip."""
+    """Identities in a frame depend on it and earlier frames only; else on the whole clip.
+    The roster then does not limit the number of people."""
     hungarian: bool = True
     """Match people and detections of a camera by the Hungarian method instead of greedily (T1)."""
     gate_m: float = Field(default=0.5, ge=1e-6, le=100)

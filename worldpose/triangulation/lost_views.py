@@ -10,7 +10,7 @@ once. The change is the shift of the view, or of the clock, with which most of t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,14 +42,36 @@ def find_lost_views(
         fps: frames per second [1/s].
         kinds: what may change.
     """
-    if len(cameras.focal) < 3 or not joints.shape[1]:
-        return []
-    seen = _middles(detections)
-    people = np.asarray(joints[:, :, _TORSO], dtype=np.float64).mean(axis=2)
-    each = (_Meetings(cameras[c], seen[:, c], people, fps) for c in range(len(cameras.focal)))
+    each = _meetings(cameras, detections, joints, fps)
     found = [camera.find_change(c, kinds) for c, camera in enumerate(each)]
     lost = [change for change in found if change is not None]
     return sorted(lost, key=lambda change: -change.gain)
+
+
+def find_lone_views(
+    cameras: Camera, detections: KeypointDetections[ClipArray], joints: AnyFloats, fps: float
+) -> dict[int, int]:
+    """Return the cameras that meet nobody from some row on, although they met people before.
+
+    The others place people in the camera's view, and it has more detections that meet nobody than
+    before: people who are hidden or who leave, and bystanders, do not add any. No change explains
+    them if `find_lost_views` does not. Arguments as there.
+    """
+    each = _meetings(cameras, detections, joints, fps)
+    rows = ((c, camera.find_lone_row()) for c, camera in enumerate(each))
+    return {c: row for c, row in rows if row is not None}
+
+
+def _meetings(
+    cameras: Camera, detections: KeypointDetections[ClipArray], joints: AnyFloats, fps: float
+) -> Iterator[_Meetings]:
+    """Yield what each camera of a rig sees, by the arguments of `find_lost_views`."""
+    if len(cameras.focal) < 3 or not joints.shape[1]:
+        return
+    seen = _middles(detections)
+    people = np.asarray(joints[:, :, _TORSO], dtype=np.float64).mean(axis=2)
+    for c in range(len(cameras.focal)):
+        yield _Meetings(cameras[c], seen[:, c], people, fps)
 
 
 _TORSO = [COCO17.index(f"{side}_{at}") for side in ("left", "right") for at in ("shoulder", "hip")]
@@ -85,11 +107,9 @@ class _Meetings:
     def find_change(self, number: int, kinds: Sequence[Kind]) -> MeasuredChange | None:
         """Return the change of this camera, the given one of the rig; None if there is none."""
         second = max(2, round(self.fps))
-        # Long clips need no more moments, and have many people.
-        every = max(1, second // 10, len(self.seen) // 3000)
-        rows = np.arange(0, len(self.seen), every)
+        rows, margin = self._moments()
         met, count = self._met(rows), self._count(rows)
-        place = _fall(met, count, max(5, second // every))
+        place = _fall(met, count, margin)
         if place is None:
             return None
         chosen = rows[np.unique(np.linspace(place, len(rows) - 1, 100).astype(int))]
@@ -125,6 +145,32 @@ class _Meetings:
         row = int(near[int(np.argmax(np.concatenate([[0], np.cumsum(gain)])[: len(near)]))])
         again = (by[kind] - now) * seen.mean() * (len(rows) - place)
         return MeasuredChange(number, kind, row, amount, gain=again)
+
+    def find_lone_row(self) -> int | None:
+        """Return the row from which on the camera's people meet nobody; None = they do."""
+        rows, margin = self._moments()
+        met, (image, _, inside) = self._met(rows), self._project(rows)
+        with np.errstate(invalid="ignore"):
+            inside &= ((image >= 0.0) & (image < self.camera.image_size)).all(axis=-1)
+        shown = inside.sum(axis=1)
+        place = _fall(met, shown, margin)
+        if place is None:
+            return None
+        alone = self._count(rows) - met
+        parts = [(shown > 0) & side for side in (rows < rows[place], rows >= rows[place])]
+        (met_before, met_now), (alone_before, alone_now) = (
+            [each[part].mean() for part in parts] for each in (met, alone)
+        )
+        more = alone_now - alone_before
+        is_alone = met_now <= 0.1 * met_before and more >= 0.5 * max(met_before, alone_before)
+        return int(rows[place]) if is_alone else None
+
+    def _moments(self) -> tuple[Integers, int]:
+        """Return rows to compare, and how many of them are the least before or after a change."""
+        second = max(2, round(self.fps))
+        # Long clips need no more moments, and have many people.
+        every = max(1, second // 10, len(self.seen) // 3000)
+        return np.arange(0, len(self.seen), every), max(5, second // every)
 
     def _count(self, rows: Integers) -> Integers:
         """Return the number (n,) of detections."""

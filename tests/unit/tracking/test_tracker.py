@@ -10,7 +10,7 @@ from data_contracts.pitch import PitchSpec
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.parameters import step_camera
-from worldpose.tracking.plane import paths
+from worldpose.tracking.plane import clocks, paths
 from worldpose.tracking.plane.clocks import estimate_plane_clocks
 from worldpose.tracking.plane.feet import ANKLE_HEIGHT, GroundPositions, locate_feet
 from worldpose.tracking.plane.paths import PlanePath, merge_paths
@@ -389,6 +389,23 @@ def test_cameras_that_share_no_runner_have_clocks_of_two_groups():
     assert clocks.groups == ((0, 1), (2, 3))
     late = GROUND_FPS * clocks.seconds
     assert (late[1] - late[0], late[3] - late[2]) == pytest.approx((5.0, 2.0), abs=0.3)
+
+
+def test_clocks_of_a_long_clip_are_compared_where_two_cameras_show_the_same_people(monkeypatch):
+    fps, frame, compared, nearest = 10.0, np.arange(1000), [], clocks._mutual
+    turn, apart = np.random.default_rng(9).uniform(0.0, 6.0, 5), 4.0 * np.arange(5)[:, None]
+
+    def places(frame):
+        phase = 0.8 * frame[:, None] / fps + turn
+        return apart + 3.0 * np.stack([np.sin(phase), np.cos(phase)], axis=-1)
+
+    seen = np.stack([places(frame), places(frame + 5)], axis=1)
+    seen[:680, 1] -= 30.0  # others
+    monkeypatch.setattr(clocks, "_mutual", lambda *at: compared.append(at) or nearest(*at))
+    found = clocks.estimate_plane_clocks(positions_at(seen), fps, pitch_size=SIZE)
+    assert fps * (found.seconds[1] - found.seconds[0]) == pytest.approx(5.0, abs=0.3)
+    # 21 offsets in every third frame of 32 s, and each second of the clip.
+    assert len(compared) < 21 * 110 + 320 + 140
 
 
 def path_of(first, frames, start, velocity, camera):

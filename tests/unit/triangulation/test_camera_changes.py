@@ -21,7 +21,7 @@ from worldpose.triangulation.clock_courses import (
     trace_clocks,
 )
 from worldpose.triangulation.clocks import triangulate_views
-from worldpose.triangulation.lost_views import find_lost_views
+from worldpose.triangulation.lost_views import find_lone_views, find_lost_views
 from worldpose.triangulation.residuals import Rig
 from worldpose.triangulation.settings import TriangulationSettings
 
@@ -202,6 +202,29 @@ def test_a_camera_whose_people_meet_nobody_is_lost(cameras, spoil, row, amount):
         assert abs(found[0].row - row) <= 1
         # What is left is measured when people are tracked again.
         np.testing.assert_allclose(found[0].amount, amount, atol=4.0)
+
+
+def hide(pixels, frame, _):
+    """Something hides the person from frame 120 on."""
+    return np.where(frame[..., None] < 120, pixels, np.nan)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "lone"),
+    [(knock(90.0, 40.0), {BAD: 120}), (hide, {}), (lambda pixels, *_: pixels, {})],
+)
+@pytest.mark.parametrize("bystander", [False, True])
+def test_a_camera_that_meets_its_only_person_no_more_is_told(cameras, spoil, lone, bystander):
+    joints, frame = runner(FRAMES, 1), np.arange(FRAMES)
+    pixels, confidence, index = detections(cameras, joints, 1.0)
+    pixels[:, BAD] = spoil(pixels[:, BAD], frame[:, None, None], cameras[BAD])
+    if bystander:  # whom no other camera sees
+        pixels, confidence = (np.repeat(each, 2, axis=2) for each in (pixels, confidence))
+        pixels[:, :, 1] = np.nan
+        pixels[:, BAD, 1] = pixels[0, BAD, 0] + [0.0, 300.0]
+    confidence = confidence * np.isfinite(pixels[..., 0])
+    seen = KeypointDetections.from_keypoints(pixels, confidence, index, frame)
+    assert find_lone_views(cameras, seen, joints, FPS) == lone
 
 
 def test_a_camera_that_sways_is_not_explained(cameras):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from itertools import combinations
 from typing import Final
 
@@ -11,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from data_contracts.arrays import Flags, Floats
 from worldpose.tracking.plane.feet import GroundPositions
-from worldpose.tracking.plane.tracker import track_on_plane
+from worldpose.tracking.plane.tracker import GroundTracks, track_on_plane
 
 MIN_RUNNERS: Final = 3
 """Least pairs of tracks that determine a clock offset [1]."""
@@ -49,7 +50,7 @@ def estimate_plane_clocks(
 
     Each camera tracks its people alone. Two cameras' tracks of one person differ by the velocity
     times the clock offset, and by the disagreement of the two calibrations, which is an affine map
-    here.
+    here. Of a long clip, two cameras are compared in the part in which they share most people.
 
     Args:
         positions: the clip's foot positions.
@@ -58,14 +59,22 @@ def estimate_plane_clocks(
         max_offset_s: largest offset between two cameras [s].
     """
     cameras = positions.xy.shape[1]
-    alone = []
-    for c in range(cameras):
-        one = {name: array[:, c : c + 1] for name, array in positions.arrays().items()}
-        given = GroundPositions(*(one[name] for name in ("xy", "noise", "calibration", "height")))
-        alone.append(track_on_plane(given, fps, pitch_size=pitch_size))
+    longest = round((30.0 + 2.0 * max_offset_s) * fps)
+
+    @cache
+    def track_alone(camera: int, first: int) -> GroundTracks:
+        at = slice(first, first + longest), slice(camera, camera + 1)
+        arrays = positions.arrays()
+        one = (arrays[name][at] for name in ("xy", "noise", "calibration", "height"))
+        return track_on_plane(GroundPositions(*one), fps, pitch_size=pitch_size)
+
+    runs = np.zeros(cameras, dtype=np.bool_)
     rows, values, weights, count = [], [], [], 0
     for a, b in combinations(range(cameras), 2):
-        found = _compare_clocks(alone[a].xy, alone[b].xy, fps, max_offset_s)
+        first = _choose_part(positions, (a, b), longest, fps, max_offset_s)
+        alone = [track_alone(camera, first) for camera in (a, b)]
+        runs[[a, b]] |= [_see_runners(each.velocity) for each in alone]
+        found = _compare_clocks(alone[0].xy, alone[1].xy, fps, max_offset_s)
         if found is None:
             continue
         row = np.zeros(cameras)
@@ -89,8 +98,32 @@ def estimate_plane_clocks(
         number, label = connected_components(matrix.T @ matrix)
         members = (tuple(np.flatnonzero(label == k).tolist()) for k in range(number))
         groups = tuple(group for group in members if len(group) > 1)
-    runs = np.array([_see_runners(each.velocity) for each in alone], dtype=np.bool_)
     return PlaneClocks(seconds, std, count, runs, groups)
+
+
+def _choose_part(
+    positions: GroundPositions,
+    pair: tuple[int, int],
+    longest: int,
+    fps: float,
+    max_offset_s: float,
+) -> int:
+    """Return the first of the `longest` frames in which most people of one camera are near others.
+
+    Within the largest offset, a runner of 5 m/s is not farther from the other camera's image.
+    """
+    frames = positions.xy.shape[0]
+    starts = np.linspace(0, max(0, frames - longest), -(-frames // longest)).astype(int)
+    if len(starts) < 2:
+        return 0
+    counts = [
+        sum(
+            len(_mutual(*(positions.xy[f, c] for c in pair), 2.0 + 5.0 * max_offset_s))
+            for f in range(start, start + longest, max(1, round(fps)))
+        )
+        for start in starts.tolist()
+    ]
+    return int(starts[int(np.argmax(counts))])
 
 
 def _see_runners(velocity: Floats) -> bool:
@@ -141,15 +174,15 @@ def _shift(b: Floats, late: float) -> Floats:
     return np.where(inside[:, None, None], between, np.nan)
 
 
-def _mutual(a: Floats, b: Floats) -> list[tuple[int, int, float]]:
-    """Return mutual nearest neighbours (i, j, distance) within 2 m of one frame."""
+def _mutual(a: Floats, b: Floats, reach: float = 2.0) -> list[tuple[int, int, float]]:
+    """Return mutual nearest neighbours (i, j, distance) of one frame, within a reach [m]."""
     distance = np.linalg.norm(a[:, None] - b[None], axis=-1)
     distance = np.where(np.isfinite(distance), distance, np.inf)
     nearest, back = distance.argmin(axis=1), distance.argmin(axis=0)
     return [
         (i, int(j), float(distance[i, j]))
         for i, j in enumerate(nearest)
-        if back[j] == i and distance[i, j] <= 2.0
+        if back[j] == i and distance[i, j] <= reach
     ]
 
 

@@ -50,11 +50,11 @@ class FrameBlocks:
         self.shape = (sum(map(len, self.parts)), first[1], most, *first[3:])
 
     def __getitem__(self, at: tuple[Any, ...]) -> NDArray[Any]:
-        """Return values of one frame, the first index; or of all frames as in `whole`."""
+        """Return values of one frame, the first index; or of several as in `whole`."""
         frame, *rest = at
         if isinstance(frame, slice):
-            whole: NDArray[Any] = self.whole()[at]
-            return whole
+            some: NDArray[Any] = self.whole(frame)[(slice(None), *rest)]
+            return some
         part, row = divmod(int(frame), self._length)
         values: NDArray[Any] = self.parts[part][(row, *rest)]
         return values
@@ -63,14 +63,14 @@ class FrameBlocks:
         """Return the array of the function's results for each part."""
         return FrameBlocks([function(part) for part in self.parts], self._length)
 
-    def whole(self) -> NDArray[Any]:
-        """Return the array in one piece, whose missing detections are NaN, -1 or False."""
-        dtype = self.parts[0].dtype
+    def whole(self, frames: slice = slice(None)) -> NDArray[Any]:
+        """Return frames in one piece, whose missing detections are NaN, -1 or False."""
+        dtype, rows = self.parts[0].dtype, np.arange(self.shape[0])[frames]
         missing = {"b": False, "i": -1}.get(dtype.kind, np.nan)
-        whole = np.full(self.shape, missing, dtype=dtype)
-        for number, part in enumerate(self.parts):
-            first = number * self._length
-            whole[first : first + len(part), :, : part.shape[2]] = part
+        whole = np.full((len(rows), *self.shape[1:]), missing, dtype=dtype)
+        for number in np.unique(rows // self._length).tolist():
+            part, here = self.parts[number], rows // self._length == number
+            whole[here, :, : part.shape[2]] = part[rows[here] - number * self._length]
         return whole
 
 
