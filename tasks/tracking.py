@@ -199,8 +199,9 @@ def _doubts(
     """Return metrics and warnings on the world's unit and axes, and on identities."""
     name, unmatched = inputs.recipe.name, tracks.report.unmatched_share or 0.0
     figures, warnings = dict[str, float](), list[str]()
-    most = 1000  # frames; more tell no more of the world
-    tracked = People.of(tracks.joints[:most], clip.fps)
+    most = 1000  # frames from the first with people; more tell no more of the world
+    first = int(np.isfinite(tracks.joints[..., 0]).any(axis=(1, 2)).argmax())
+    tracked = People.of(tracks.joints[first : first + most], clip.fps)
     if tracked is not None:
         figures["median_stature_m"] = tracked.stature
         # With many detections left over, people are rays that meet by chance.

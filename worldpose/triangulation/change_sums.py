@@ -65,13 +65,15 @@ class ChangeSums:
     def join(cls, parts: Sequence[ChangeSums], cameras: Camera, fps: float) -> Self:
         """Return the equations of several stretches of a clip, of a batch of cameras."""
         size = WIDTH * len(cameras.focal)
-        return cls(
-            np.concatenate([np.zeros((0, size, size)), *(one.matrix for one in parts)]),
-            np.concatenate([np.zeros((0, size)), *(one.score for one in parts)]),
-            np.concatenate([np.zeros(0), *(one.rows for one in parts)]),
-            fps,
-            cameras.focal.mean(axis=-1),
-        )
+        every = np.concatenate([np.zeros((0, size, size)), *(one.matrix for one in parts)])
+        pulls = np.concatenate([np.zeros((0, size)), *(one.score for one in parts)])
+        middles = np.concatenate([np.zeros(0), *(one.rows for one in parts)])
+        # Two stretches may share a bin.
+        rows, number = np.unique(middles, return_inverse=True)
+        matrix, score = np.zeros((len(rows), *every.shape[1:])), np.zeros((len(rows), size))
+        np.add.at(matrix, number, every)
+        np.add.at(score, number, pulls)
+        return cls(matrix, score, rows, fps, cameras.focal.mean(axis=-1))
 
     @property
     def cameras(self) -> int:

@@ -99,25 +99,29 @@ def add_slow_drifts(
     span = min(frames // 2, round(end_s * fps))
     if span < 2:
         return list(courses)
-    late, std, groups = [], [], []
-    for rows in (slice(0, span), slice(frames - span, frames)):
-        found = synchronize(cameras, detections[rows], fps, max_offset_s=max_offset_s, pitch=pitch)
-        late.append(found.late)
-        std.append(found.std)
-        groups.append(found.groups)
-    change = late[1] - late[0]
-    for group in groups[0]:
+    first, last = (
+        synchronize(cameras, detections[rows], fps, max_offset_s=max_offset_s, pitch=pitch)
+        for rows in (slice(0, span), slice(frames - span, frames))
+    )
+    begin, change = first.late.copy(), last.late - first.late
+    limit = np.maximum(min_score * np.hypot(first.std, last.std), min_frames)
+    for group in first.groups:
         # Each end has its own zero, the median of the cameras whose offset it knows.
-        both = [c for c in group if np.isfinite(change[c])]
-        change[both] -= np.median(change[both]) if both else 0.0
-    drifts = np.abs(change) > np.maximum(min_score * np.hypot(*std), min_frames)
-    end = 0.5 * (frames - 1) / (frames - span) * change
-    return [
-        [(0, course[0][1] - float(end[c])), (frames - 1, course[0][1] + float(end[c]))]
-        if drifts[c] and len(course) == 1
-        else course
-        for c, course in enumerate(courses)
-    ]
+        both = np.array([c for c in group if np.isfinite(change[c])], dtype=int)
+        if len(both):
+            change[both] -= np.median(change[both])
+            steady = both[np.abs(change[both]) <= limit[both]]
+            kept = [courses[c][0][1] - begin[c] for c in (steady if len(steady) else both)]
+            begin[both] += np.median(kept)
+    drifts = np.abs(change) > limit
+    # The ends' offsets are those of their middles.
+    before, after = (0.5 * (span - 1) + np.array([0.0, frames - span])).tolist()
+    found = []
+    for c, course in enumerate(courses):
+        slope = float(change[c]) / (after - before)
+        line = [(row, float(begin[c]) + slope * (row - before)) for row in (0, frames - 1)]
+        found.append(line if drifts[c] and len(course) == 1 else course)
+    return found
 
 
 def shift_by_courses(

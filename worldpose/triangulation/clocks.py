@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import AnyFloats, ClipArray, Floats, Integers
+from data_contracts.arrays import AnyFloats, ClipArray, Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import Record
 from worldpose.compiled import compile_kernel, map_in_threads
@@ -90,7 +90,7 @@ def estimate_clocks(
     unknown = 10.0  # Standard deviation of an undetermined offset [frame].
     late, error = np.zeros(count), np.full(count, unknown)
     # Length of an interval [s]; errors within an interval count as one.
-    parts = choose_intervals(detections.detection_index.shape, max(3, round(1.0 * fps)))
+    parts = choose_intervals(have_views(detections, 2), max(3, round(1.0 * fps)))
     # By person, which takes a fraction of the memory of all detections.
     seen = [shift_in_time(detections[part], late) for part in parts]
     for gate in GATES if parts else ():
@@ -119,7 +119,10 @@ def estimate_clocks(
 
 
 def _standard_error(sums: PersonSums, step: Floats, inverse: Floats, unknown: float) -> Floats:
-    """Return the standard error (cameras,) [frame] of a step, the solution of summed equations."""
+    """Return the standard error (cameras,) [frame] of a step, the solution of summed equations.
+
+    It is `unknown` where nothing tells.
+    """
     information = sums.information
     # Cameras without information are not part of the mean.
     telling = np.diagonal(information.sum(axis=0)) > 1.0 / unknown**2
@@ -132,17 +135,28 @@ def _standard_error(sums: PersonSums, step: Floats, inverse: Floats, unknown: fl
     stated = np.einsum("cd,de,ce->c", centered, information.sum(axis=0), centered)
     alike = sums.common_score()
     variance = np.maximum((left**2).sum(axis=0), stated) + centered**2 @ alike**2
-    return np.asarray(np.sqrt(variance))
+    return np.where(telling, np.sqrt(variance), unknown)
 
 
-def choose_intervals(shape: tuple[int, ...], length: int) -> list[slice]:
-    """Return intervals of frames spread over the clip, with enough person-frames in total."""
-    frames, _, persons = shape
-    starts = np.arange(0, max(1, frames - length + 1), length)
+def choose_intervals(there: Flags, length: int) -> list[slice]:
+    """Return intervals of frames with people, spread over the clip; `there` as of `have_views`."""
+    starts = np.arange(0, max(1, len(there) - length + 1), length)
+    people = np.array([there[start : start + length].any(axis=0).sum() for start in starts])
+    starts, people = starts[people > 0], people[people > 0]
     # Person-frames in the sample.
-    wanted = max(1, 3000 // max(1, length * persons))
+    wanted = max(1, 3000 // int(np.ceil(length * people.mean()))) if len(people) else 0
     chosen = np.unique(np.linspace(0, len(starts) - 1, min(len(starts), wanted)).astype(int))
-    return [slice(int(starts[n]), int(starts[n]) + length) for n in chosen if persons]
+    return [slice(int(starts[n]), int(starts[n]) + length) for n in chosen]
+
+
+def have_views(detections: KeypointDetections[ClipArray], views: int) -> Flags:
+    """Return whether at least `views` cameras see each person (frames, persons)."""
+    index, length = detections.detection_index, 512
+    parts = [
+        (index[start : start + length] >= 0).sum(axis=1) >= views
+        for start in range(0, max(1, len(index)), length)
+    ]
+    return np.concatenate(parts)
 
 
 @dataclass(frozen=True, eq=False)

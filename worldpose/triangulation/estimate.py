@@ -28,7 +28,7 @@ from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera, Cameras
 from worldpose.ingest.clock import row_rate
 from worldpose.reference_method import require_torch
-from worldpose.triangulation.clocks import estimate_clocks, read_frames
+from worldpose.triangulation.clocks import estimate_clocks, have_views, read_frames
 from worldpose.triangulation.limb_lengths import (
     find_swaps,
     limb_lengths,
@@ -123,8 +123,8 @@ def learn_clip(
     """
     clocks = estimate_clocks(cameras, detections, fps, settings)
     late = clocks.late if settings.correct_clocks else None
-    joints = detections.confidence.shape[-1]
-    chosen = sample_frames(detections.detection_index.shape, joints)
+    joints, there = detections.confidence.shape[-1], have_views(detections, settings.min_views)
+    chosen = sample_frames(there, joints)
     sample = read_frames(detections, chosen, late)
     detector = learn_detector(cameras, sample, settings, camera_covariance)
 
@@ -136,7 +136,7 @@ def learn_clip(
         precision = raw.noise.precision(unswapped.confidence, conditions(unswapped.keypoints))
         return select_person(unswapped, precision, raw.offsets, raw.joints, person=0)
 
-    intervals = choose_stretches(_have_views(detections, settings.min_views), fps)
+    intervals = choose_stretches(there, fps)
     tracks = (read_track(person, frames) for person, frames in intervals)
     motion = learn_motion(Rig.from_cameras(cameras), tracks, joints, fps, settings)
     return ClipModel(clocks, late, detector, motion)
@@ -251,7 +251,8 @@ def triangulate_joints(
     if model is None and (
         settings.learn_noise or settings.offsets == "body" or settings.repair_limb_lengths
     ):
-        chosen = sample_frames(detections.detection_index.shape, detections.confidence.shape[-1])
+        there = have_views(detections, settings.min_views)
+        chosen = sample_frames(there, detections.confidence.shape[-1])
         model = learn_detector(cameras, detections[chosen], settings, camera_covariance)
     passes = _Passes(cameras, detections, settings, camera_covariance, model)
     learned, solved = passes.run(), passes.solved
@@ -426,22 +427,30 @@ class _Passes:
         return np.full(count, bias)
 
 
-def sample_frames(shape: tuple[int, ...], joints: int) -> NDArray[np.int64]:
-    """Return frames all over a clip of `shape` (frames, cameras, persons) to learn from."""
-    frames, _, persons = shape
+def sample_frames(there: Flags, joints: int) -> NDArray[np.int64]:
+    """Return frames to learn from: all over those with people, and some of each person.
+
+    Args:
+        there: (frames, persons), as of `have_views`.
+        joints: number of joints of a person.
+    """
+    present = there.sum(axis=1)
+    busy = np.flatnonzero(present)
+    if not len(busy):
+        return np.arange(min(1, len(there)))
     # A confidence class then has thousands of observations.
-    number = min(frames, 1 + 6000 // max(1, persons * joints))
-    return np.unique(np.linspace(0, frames - 1, number).astype(np.int64))
+    chosen = _spread(busy, 1 + 6000 // int(np.ceil(present[busy].mean() * joints)))
+    # Lengths of a person's limbs need five frames.
+    for own in there.T:
+        if own[chosen].sum() < 5:
+            chosen = np.union1d(chosen, _spread(np.flatnonzero(own), 5))
+    return chosen
 
 
-def _have_views(detections: KeypointDetections[ClipArray], views: int) -> Flags:
-    """Return whether at least `views` cameras saw each person (frames, persons)."""
-    index = detections.detection_index
-    parts = [
-        (index[start : start + CHUNK] >= 0).sum(axis=1) >= views
-        for start in range(0, max(1, len(index)), CHUNK)
-    ]
-    return np.concatenate(parts)
+def _spread(frames: NDArray[np.int64], number: int) -> NDArray[np.int64]:
+    """Return at most so many of the frames, evenly."""
+    places = np.linspace(0, len(frames) - 1, min(len(frames), number)).astype(np.int64)
+    return np.unique(frames[places])
 
 
 def _join_halves(

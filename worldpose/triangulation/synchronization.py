@@ -32,6 +32,7 @@ from worldpose.triangulation.clocks import (
     MovingJoints,
     PersonSums,
     choose_intervals,
+    have_views,
     shift_in_time,
     sum_equations,
 )
@@ -232,7 +233,7 @@ def _estimate_fractions(
     that moves people by a few centimetres is not taken for one of the clock.
     """
     settings = TriangulationSettings()
-    count, frames = int(cameras.batch_shape[0]), len(people.keypoints)
+    count = int(cameras.batch_shape[0])
     late, error = np.zeros(count), np.full(count, np.inf)
     # Length of an interval [s]; a person's errors within an interval count as one.
     length = max(3, round(0.5 * fps))
@@ -243,7 +244,7 @@ def _estimate_fractions(
         loose = settings.model_copy(update={"max_deviation": gate})
         common = shift_in_time(people, late)
         rig = Rig.from_cameras(cameras)
-        intervals = choose_intervals((frames, count, people.detection_index.shape[2]), length)
+        intervals = choose_intervals(have_views(people, 2), length)
         parts = [
             sum_equations(MovingJoints.find(rig, common[part], fps, loose), with_cameras=True)
             for part in intervals

@@ -244,6 +244,10 @@ def test_a_drift_too_slow_to_be_traced_is_told_by_both_ends(cameras):
     rows, values = np.array(courses[BAD]).T
     assert rows.tolist() == [0, FRAMES - 1]
     np.testing.assert_allclose(values, [0.0, 0.01 * FRAMES], atol=0.3)
+    # The offsets of the ends count, also where the given one is that of another part.
+    given[BAD] = [(0, 0.0)]
+    _, values = np.array(add_slow_drifts(given, cameras, untracked, FPS, max_offset_s=0.4)[BAD]).T
+    np.testing.assert_allclose(values, [0.0, 0.01 * FRAMES], atol=0.3)
     # Both ends of a clip of one frame are the same.
     assert add_slow_drifts(given, cameras, untracked[:1], FPS, max_offset_s=0.4) == given
 
@@ -318,3 +322,19 @@ def test_a_step_that_covers_a_short_clip_stays_as_it_is():
         np.tile(np.eye(5), (len(rows), 1, 1)), np.zeros((len(rows), 5)), rows, 25.0, np.ones(1)
     )
     assert fit_parts(sums, parts, 25, ("clock",)) == parts
+
+
+def test_a_bin_of_two_chunks_is_one_bin(cameras):
+    size = 5 * len(cameras.focal)
+
+    def chunk(*rows):
+        many = (len(rows), 1)
+        matrix, score = np.tile(np.eye(size), (*many, 1)), np.ones((len(rows), size))
+        return ChangeSums(matrix, score, np.array(rows), FPS, np.ones(len(cameras.focal)))
+
+    joined = ChangeSums.join([chunk(2.0, 7.0), chunk(7.0, 12.0)], cameras, FPS)
+    assert joined.rows.tolist() == [2.0, 7.0, 12.0]
+    assert joined.matrix[:, 0, 0].tolist() == [1.0, 2.0, 1.0]
+    assert joined.score[:, 3].tolist() == [1.0, 2.0, 1.0]
+    # A clip without people has no bins.
+    assert ChangeSums.join([], cameras, FPS).matrix.shape == (0, size, size)

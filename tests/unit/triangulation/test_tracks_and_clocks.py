@@ -12,12 +12,13 @@ from worldpose.geometry.rigid import Rigid, Similarity
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
-from worldpose.triangulation.clocks import estimate_clocks, move_to_match_time
+from worldpose.triangulation.clocks import choose_intervals, estimate_clocks, move_to_match_time
 from worldpose.triangulation.estimate import (
     MARGIN,
     learn_clip,
     reconstruct_chunks,
     reconstruct_joints,
+    sample_frames,
     triangulate_joints,
 )
 from worldpose.triangulation.settings import TriangulationSettings
@@ -101,6 +102,24 @@ def test_late_clocks_are_found(ring):
         result.triangulation.report.reprojection_error_px
         < 0.7 * plain.triangulation.report.reprojection_error_px
     )
+
+
+def test_clocks_are_unknown_where_nobody_is_seen_by_two_cameras(ring):
+    keypoints, confidence, index = late_detections(ring(3), 100, np.zeros(3))
+    index[:, 1:] = -1
+    clocks = estimate_clocks(ring(3), as_detections(keypoints, confidence, index), FPS, SETTINGS)
+    assert not clocks.determined.any()
+    assert clocks.standard_error.min() > 5.0
+
+
+def test_samples_are_of_frames_with_people_and_of_each_person():
+    there = np.zeros((9000, 300), bool)
+    for person in range(300):
+        there[3000 + 20 * person : 3010 + 20 * person, person] = True
+    chosen = sample_frames(there, 17)
+    assert there[chosen].sum(axis=0).min() >= 5
+    assert there[chosen].any(axis=1).all()
+    assert min(part.start for part in choose_intervals(there, 25)) >= 2975
 
 
 def test_keypoints_move_along_the_persons_path_to_the_match_frame():
