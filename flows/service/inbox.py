@@ -25,7 +25,7 @@ from flows.registering import register
 from flows.service.layout import PRIORITIES, StateFolder
 from flows.stage import Match
 from worldpose.errors import InputError, InternalError, StoreError, WorldposeError
-from worldpose.formats.files import read_yaml
+from worldpose.formats.files import read_yaml, sha256_of_file
 from worldpose.ingest.match_folder import unclicked_clips
 from worldpose.ingest.validation import require_local
 from worldpose.store.store import Store
@@ -119,9 +119,8 @@ def missing_of(path: Path) -> str:
         file = path / name
         if not file.is_file():
             return f"{name} of {SUMS} is not there"
-        with file.open("rb") as content:
-            if hashlib.file_digest(content, "sha256").hexdigest() != digest:
-                return f"{name} is not as {SUMS} says"
+        if sha256_of_file(file) != digest:
+            return f"{name} is not as {SUMS} says"
     return ""
 
 
