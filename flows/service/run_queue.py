@@ -74,8 +74,9 @@ def find_process(pid: int | None, argument: str) -> psutil.Process | None:
 def beating(queue: RunQueue, run: QueuedRun, inputs: Path | None = None) -> Iterator[None]:
     """Write heartbeats while the calling thread makes progress in the block.
 
-    Progress is processor time of this thread, or bytes of files that any thread hashes. While it waits for units, which have time limits
-    of their own, the process and the disks of the store and of the folder `inputs` must answer.
+    Progress is processor time of this thread, or bytes of files that any thread hashes. While it
+    waits for units, which have time limits of their own, the process and the disks of the store
+    and of the folder `inputs` must answer.
     """
     ended, clock = threading.Event(), _clock_of_this_thread()
 
