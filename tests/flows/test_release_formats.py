@@ -2,9 +2,7 @@
 
 import dataclasses
 import json
-import re
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,15 +11,13 @@ import pytest
 import xarray as xr
 from run_records import StubRun, match_spec
 from stand_ins import empty_store
-from typer.testing import CliRunner
 
-from data_contracts.release import EXPORT_FORMATS, EXPORT_PURPOSES, BaselineSettings
-from flows.cli.app import app
+from data_contracts.release import BaselineSettings
 from flows.reports import clips
 from flows.results import best_results
 from flows.results.best_results import Origin
 from flows.results.data_set_release import _write_clip
-from flows.results.export import CLASHING, COUNTED, EXPORTS, export
+from flows.results.export import EXPORTS, export
 from flows.results.tool_exports import image_views
 from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import CHALLENGE15, HALPE26, fold_keypoints
@@ -98,20 +94,6 @@ def origin(folder, **results):
 
 def write(form, run, out):
     return list(EXPORTS[form](run, out))
-
-
-def test_every_format_has_a_writer_and_is_named_in_the_help_and_the_reference():
-    help_text = CliRunner().invoke(app, ["export", "--help"], env={"COLUMNS": "200"}).output
-    help_text = re.sub(r"-\n\s+", "-", help_text)  # a line may end at a hyphen
-    page = (Path(__file__).parents[2] / "docs/reference/formats.md").read_text()
-    assert tuple(EXPORTS) == EXPORT_FORMATS
-    assert set(EXPORT_FORMATS) >= CLASHING | COUNTED
-    for name, purpose in EXPORT_PURPOSES.items():
-        assert f"{name:15} {purpose}\n" in help_text, name
-        assert f"- `{name}`: {purpose}" in page
-    for name in EXPORT_FORMATS:
-        assert re.search(rf"\b{name}\b(?!-)", help_text), name
-        assert f"| `{name}` |" in page
 
 
 def test_labels_are_where_people_are_at_the_moments_of_the_images(match_folder, tmp_path):

@@ -367,17 +367,6 @@ def test_a_stray_file_among_the_venues_closes_no_door(tmp_path):
     assert (answer.exit_code, found["problem"] in answer.stderr) == (0, True)
 
 
-def test_layers_are_kept_in_object_storage_too(bucket):
-    store = Store.create(f"{bucket}/layers")
-    write_layer(store, "venues/hall", {"lenses": [], "tracking.gate_m": 0.6})
-    write_layer(store, "project", {"iterations": "auto"})
-    assert layers.list_venues(store) == ("hall",)
-    assert resolve(layers.project_layers(store)).general.iterations == "auto"
-    write_layer(store, "project", {})
-    (entry,) = store.blobs.entries("settings")
-    assert entry.path == "settings/venues/hall.yaml"
-
-
 @pytest.mark.usefixtures("server")
 def test_exports_follow_each_run_and_a_failed_one_says_that_the_run_is_kept(store):
     write_layer(store, "project", {"exports": ["joints"]})

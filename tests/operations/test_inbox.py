@@ -26,6 +26,8 @@ from flows.service.layout import StateFolder
 from flows.service.plan import ServePlan
 from flows.service.recovery import recover
 from worldpose.errors import InputError
+from worldpose.simulation.matches import MatchOptions, simulate_match
+from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.store.store import Store
 
 
@@ -383,6 +385,22 @@ def test_what_is_taken_out_of_the_inbox_is_forgotten_unless_it_was_taken_in(desk
     shutil.rmtree(desk.inbox / "good")
     desk.look()
     assert set(desk.known()) == {"good"}
+
+
+def test_another_match_in_a_folder_of_a_known_name_is_taken_in(desk, drop):
+    folder, away = drop(), desk.inbox.with_name("away")
+    desk.look()
+    desk.take_in()
+    folder.rename(away)
+    desk.look()
+    away.rename(folder)  # the disk of the inbox was away
+    assert (desk.look(), desk.look(), desk.take_in()) == (0, 0, [])
+    folder.rename(away)
+    options = MatchOptions(duration=0.2, cameras=3, players=2, stills=False, video=False)
+    simulate_match(SCENARIOS["tiny"], 1, folder, options)
+    assert (desk.look(), desk.look()) == (0, 1)
+    (taken,) = desk.take_in()
+    assert (taken.state, len(desk.begun), len(desk.store.matches())) == ("taken", 2, 2)
 
 
 def take_in_and_count(folder, queue, kill):

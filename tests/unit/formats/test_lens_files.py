@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 from run_records import calibration
 
-from data_contracts.cameras import COEFFICIENTS
 from worldpose.errors import InputError
 from worldpose.formats.calibration_forms import read_calibration
 from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.formats.lens_files import read_lens_toml, read_lenses, write_lens_toml
 from worldpose.geometry.cameras import Camera, camera_arrays, camera_from_arrays
-from worldpose.geometry.lens_fit import fit_brown_lens
 
 MATRIX = np.array([[1400.0, 0.0, 970.0], [0.0, 1404.0, 530.0], [0.0, 0.0, 1.0]])
 DISTORTION = np.array([[-0.31, 0.12, 0.001, -0.002, -0.03]])
@@ -499,21 +497,3 @@ def test_a_lens_whose_model_is_unknown_or_unsaid_is_refused(lens, said, tmp_path
     file.write_text(f"K: [[400, 0, 319.5], [0, 400, 239.5], [0, 0, 1]]\n{lens}\n")
     with pytest.raises(InputError, match=said):
         read_lenses([file], "a", SIZE)
-
-
-def test_records_refuse_coefficients_of_another_model():
-    for model, names in COEFFICIENTS.items():
-        with pytest.raises(ValueError, match="found 3 numbers"):
-            camera_of("fisheye", lens_model=model, distortion=(0.0,) * 3)
-        assert camera_of("fisheye", lens_model=model, distortion=(0.0,) * len(names))
-
-
-@pytest.mark.parametrize("model", LENSES)
-def test_browns_nearest_lens_states_its_largest_error(model):
-    camera = Camera.from_calibration(camera_of(model, focal_px=(700.0, 700.0)))
-    near, error = fit_brown_lens(camera)
-    rng = np.random.default_rng(0)
-    rays = camera.unproject(rng.uniform([0, 0], [639, 479], (500, 2)))
-    points = rays.origins + 5.0 * rays.directions
-    off = np.linalg.norm(near.project(points) - camera.project(points), axis=1)
-    assert 0.2 * error < off.max() <= 1.01 * error < 0.1
