@@ -169,7 +169,7 @@ class BucketInbox:
             self._objects.download(each.path, draft / each.path.removeprefix(f"{name}/"))
         self._keep(name, [*self._copied.get(name, [""]), _fingerprint_files(draft)])
         if target.exists():
-            LOG.info("%s: the copy before is now %s", target, set_aside(self.inbox, target))
+            LOG.warning("%s: the copy before is now %s", target, set_aside(self.inbox, target))
         draft.rename(target)
 
     def _keep(self, name: str, fingerprints: list[str]) -> None:
