@@ -196,13 +196,13 @@ def _track_people(inputs: UnitInputs) -> Tracked:
 def _describe_changes(
     clip: ClipInputs, tracks: Tracking, changes: Sequence[CameraChange]
 ) -> list[str]:
-    """Return sentences about cameras that change, and others that meet nobody from a frame on."""
+    """Return sentences about cameras that change, and others whose people meet nobody any more."""
     lone = find_lone_views(clip.cameras, clip.detections, tracks.joints, clip.fps)
     explained = {change.camera for change in changes}
     return [f"{describe_change(change)}." for change in changes] + [
-        f"camera {clip.camera_ids[c]}: from frame {clip.detections.frame[row]} on its people meet "
-        "nobody, though other cameras place people in its view. Look whether it moved, or its "
-        "clock changed."
+        f"camera {clip.camera_ids[c]}: from frame {clip.detections.frame[row]} on most of its "
+        "people meet nobody, though other cameras place people in its view. Look whether it moved, "
+        "or its clock changed."
         for c, row in lone.items()
         if clip.camera_ids[c] not in explained
     ]

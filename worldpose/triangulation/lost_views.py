@@ -51,7 +51,7 @@ def find_lost_views(
 def find_lone_views(
     cameras: Camera, detections: KeypointDetections[ClipArray], joints: AnyFloats, fps: float
 ) -> dict[int, int]:
-    """Return the cameras that meet nobody from some row on, although they met people before.
+    """Return the cameras most of whose people meet nobody from some row on, and that row.
 
     The others place people in the camera's view, and it has more detections that meet nobody than
     before: people who are hidden or who leave, and bystanders, do not add any. No change explains
@@ -147,23 +147,26 @@ class _Meetings:
         return MeasuredChange(number, kind, row, amount, gain=again)
 
     def find_lone_row(self) -> int | None:
-        """Return the row from which on the camera's people meet nobody; None = they do."""
+        """Return the row from which on most of the camera's people meet nobody; None = they do."""
         rows, margin = self._moments()
-        met, (image, _, inside) = self._met(rows), self._project(rows)
-        with np.errstate(invalid="ignore"):
-            inside &= ((image >= 0.0) & (image < self.camera.image_size)).all(axis=-1)
-        shown = inside.sum(axis=1)
-        place = _fall(met, shown, margin)
+        met, count = self._met(rows), self._count(rows)
+        place = _fall(met, count, margin)
         if place is None:
             return None
-        alone = self._count(rows) - met
-        parts = [(shown > 0) & side for side in (rows < rows[place], rows >= rows[place])]
+        image, _, inside = self._project(rows)
+        with np.errstate(invalid="ignore"):
+            inside &= ((image >= 0.0) & (image < self.camera.image_size)).all(axis=-1)
+        shown = inside.any(axis=1)
+        parts = [shown & side for side in (rows < rows[place], rows >= rows[place])]
+        if min(part.sum() for part in parts) < margin:
+            return None
         (met_before, met_now), (alone_before, alone_now) = (
-            [each[part].mean() for part in parts] for each in (met, alone)
+            [each[part].mean() for part in parts] for each in (met, count - met)
         )
-        more = alone_now - alone_before
-        is_alone = met_now <= 0.1 * met_before and more >= 0.5 * max(met_before, alone_before)
-        return int(rows[place]) if is_alone else None
+        # In small rooms, some meet others by chance.
+        is_rare = met_now <= 0.4 * met_before
+        more, least = alone_now - alone_before, max(met_before - met_now, alone_before)
+        return int(rows[place]) if is_rare and more >= 0.5 * least else None
 
     def _moments(self) -> tuple[Integers, int]:
         """Return rows to compare, and how many of them are the least before or after a change."""

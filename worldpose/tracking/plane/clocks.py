@@ -73,7 +73,7 @@ def estimate_plane_clocks(
     for a, b in combinations(range(cameras), 2):
         first = _choose_part(positions, (a, b), longest, fps, max_offset_s)
         alone = [track_alone(camera, first) for camera in (a, b)]
-        runs[[a, b]] |= [_see_runners(each.velocity) for each in alone]
+        runs[[a, b]] |= np.array([_see_runners(each.velocity) for each in alone])
         found = _compare_clocks(alone[0].xy, alone[1].xy, fps, max_offset_s)
         if found is None:
             continue
@@ -116,9 +116,10 @@ def _choose_part(
     starts = np.linspace(0, max(0, frames - longest), -(-frames // longest)).astype(int)
     if len(starts) < 2:
         return 0
+    (one, other), reach = pair, 2.0 + 5.0 * max_offset_s
     counts = [
         sum(
-            len(_mutual(*(positions.xy[f, c] for c in pair), 2.0 + 5.0 * max_offset_s))
+            len(_mutual(positions.xy[f, one], positions.xy[f, other], reach))
             for f in range(start, start + longest, max(1, round(fps)))
         )
         for start in starts.tolist()
