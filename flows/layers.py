@@ -30,7 +30,7 @@ from worldpose.ingest.match_folder import MatchFolder, image_sizes
 from worldpose.ingest.pitch_file import pitch_file, read_pitch
 from worldpose.ingest.validation import validate_record
 from worldpose.pitch.template import PitchTemplate
-from worldpose.store.paths import checked_name
+from worldpose.store.paths import checked_name, is_name
 from worldpose.store.store import Run, Store
 
 PROJECT: Final = "project"
@@ -108,10 +108,25 @@ def project_layers(store: Store) -> tuple[Layer, ...]:
 
 
 def list_venues(store: Store) -> tuple[str, ...]:
-    """Return the names of the venues with a layer, sorted."""
-    top = layer_path(f"{VENUES}/x").rpartition("/")[0]
-    paths = (entry.path.rpartition("/")[2] for entry in store.blobs.entries(top))
-    return tuple(sorted(path.removesuffix(".yaml") for path in paths if path.endswith(".yaml")))
+    """Return the names of the venues with a layer, sorted; see `say_unnamed_venues`."""
+    return tuple(sorted(filter(is_name, _venue_files(store))))
+
+
+def say_unnamed_venues(store: Store) -> str:
+    """Return what is wrong with venues' files that `list_venues` leaves out for their names."""
+    for name in _venue_files(store):
+        try:
+            checked_name(name)
+        except InputError as error:
+            return f"{store.url}/settings/{VENUES}/{name}.yaml is not used: {error}"
+    return ""
+
+
+def _venue_files(store: Store) -> list[str]:
+    """Return the names of the venues' files without `.yaml`, without hidden files."""
+    paths = (entry.path for entry in store.blobs.entries(f"settings/{VENUES}"))
+    names = (path.rpartition("/")[2] for path in paths if path.endswith(".yaml"))
+    return [name.removesuffix(".yaml") for name in names if not name.startswith(".")]
 
 
 def write_layer(store: Store, name: str, values: Mapping[str, Any]) -> None:

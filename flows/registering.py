@@ -27,20 +27,34 @@ if TYPE_CHECKING:
 
 
 def register(
-    store: Store, folder: Path, *, unfinished: bool = False, replaces: str | None = None
+    store: Store,
+    folder: Path,
+    *,
+    unfinished: bool = False,
+    replaces: str | None = None,
+    known_as: str | None = None,
 ) -> tuple[Match, bool]:
     """Validate and register a match folder; return whether it was new or changed.
 
     The same content under another name is the same match. A known match with changed videos,
     detections or pitch is another match and needs another id, unless it is the next version of the
     folder that it `replaces`: then runs, corrections and names stay. `unfinished` accepts it
-    without all cameras known; people click them on the pages.
+    without all cameras known; people click them on the pages. `known_as` is the id that the folder
+    must have.
 
     Raises:
         InputError: the folder is not a valid match, or its id or content is already registered.
     """
     spec = read_spec(folder)
     match_id = spec.match_id
+    if known_as not in (None, match_id):
+        raise InputError(
+            f"{folder}: match.yaml: match_id",
+            expected=f"{known_as}, which is registered with this folder",
+            found=match_id,
+            todo=f"Put the files of {known_as} back there, or register their new folder: worldpose "
+            "ingest FOLDER.",
+        )
     previous = store.registration(match_id)
     with reachable(folder):
         at_home = previous is not None and previous.folder == str(folder.resolve())
@@ -91,21 +105,21 @@ def open_match(store: Store, match_id: str) -> Match:
     """Open a registered match and read its folder again: annotations may have changed since.
 
     Raises:
-        InputError: there is no such match, or its folder is invalid.
+        InputError: there is no such match, or its folder is invalid or holds another match.
     """
-    return register(store, _registered_folder(store, match_id))[0]
+    return _open_registered(store, match_id, unfinished=False)
 
 
 def open_for_review(store: Store, match_id: str) -> Match:
     """Open a registered match like `open_match`, even if cameras are missing."""
-    return register(store, _registered_folder(store, match_id), unfinished=True)[0]
+    return _open_registered(store, match_id, unfinished=True)
 
 
 def open_stored(store: Store, name: str) -> Match:
     """Open a registered match, given by folder or id, to show its results.
 
-    If its folder is away or invalid, the match is as the project knows it: without images and
-    clicks.
+    If its folder is away, invalid or another match's now, the match is as the project knows it:
+    without images and clicks.
 
     Raises:
         InputError: there is no such match.
@@ -125,13 +139,9 @@ def open_stored(store: Store, name: str) -> Match:
         return Match(folder, registration, journal, layers=layers)
 
 
-def _registered_folder(store: Store, match_id: str) -> Path:
-    """Return the folder of a registered match.
-
-    Raises:
-        InputError: there is no such match, or its folder is not where it was.
-    """
-    folder = Path(find_registration(store, match_id).folder)
+def _open_registered(store: Store, name: str, *, unfinished: bool) -> Match:
+    known = find_registration(store, name)
+    match_id, folder = known.spec.match_id, Path(known.folder)
     if not _is_there(folder):
         raise InputError(
             f"match {match_id}",
@@ -140,7 +150,7 @@ def _registered_folder(store: Store, match_id: str) -> Path:
             todo="Mount its disk. If it was moved, or restored elsewhere, register it there, and "
             "its results stay: worldpose ingest FOLDER.",
         )
-    return folder
+    return register(store, folder, unfinished=unfinished, known_as=match_id)[0]
 
 
 def find_registration(store: Store, name: str) -> Registration:

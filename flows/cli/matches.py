@@ -18,6 +18,7 @@ from flows.layers import known_pitch
 from flows.registering import register
 from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError
+from worldpose.formats.calibration_unit import doubt_middle
 from worldpose.ingest.camera_data import import_camera_data
 from worldpose.ingest.clicks import import_clicks
 from worldpose.ingest.importing import import_lenses, import_match, import_videos
@@ -237,6 +238,8 @@ def _import_lenses(files: list[Path], out: Path, camera: str | None) -> None:
             f"({lens.principal_point_std_px:.1f}), the image's corner "
             f"{100 * lens.distortion_std:.2g} % of its distance; its pose comes from clicks"
         )
+        for warning in doubt_middle(name, lens.principal_point_px, lens.image_size):
+            line(warning)
 
 
 def _import_clicks(file: Path, out: Path, camera: str | None, store: Store) -> None:

@@ -162,6 +162,7 @@ def _print_addresses(
         "inbox": f"{plan.inbox}",
         "Prefect": plan.dashboard,
         "metrics": f"http://{plan.host}:{plan.metrics_port}/metrics",
+        **{f"{flow} at": f"{it.cron} {it.timezone}" for flow, it in plan.schedules.items()},
     }
     remarks = {
         "pages": f"open it in a browser; the token is in {pages_token_at}",

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from data_contracts.match import MatchSpec
-from flows.cli.console import answer, line, print_json
+from flows.cli.console import answer, errors, line, print_json
 from flows.cli.options import DEFAULT_PROJECT
 from flows.layers import (
     PROJECT,
@@ -21,6 +21,7 @@ from flows.layers import (
     project_layers,
     read_layer,
     read_layers,
+    say_unnamed_venues,
 )
 from flows.registering import find_match, find_registration
 from flows.settings import as_text, known_settings, parse_value, require_known, resolve, save_layer
@@ -79,6 +80,8 @@ def settings(
         venues = {each: read_layer(store, f"{VENUES}/{each}") for each in list_venues(store)}
         told["venues"] = {each: dict(layer.values) for each, layer in venues.items()}
     answer(told, *_lines(told))
+    if problem := say_unnamed_venues(store):
+        line(problem, to=errors)
 
 
 def _read(

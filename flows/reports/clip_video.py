@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,9 @@ from flows.reports.broadcast import (
     write_broadcast_video,
 )
 from flows.reports.match_pictures import frame_pictures, shown_pitch
-from flows.results.best_results import body_tracks, joint_tracks, placed_joints
+from flows.results.best_results import Origin, body_tracks, joint_tracks, placed_joints
 from flows.results.run_cameras import broadcast_views, static_cameras
+from flows.results.tool_exports import image_views
 from flows.stage import Match
 from worldpose.geometry.cameras import Camera
 from worldpose.reports.videos import overlay_frames
@@ -63,9 +65,11 @@ def write_clip_video(
         return
     tracks = joint_tracks(run, clip)
     frames = video_frames(run, match, clip, owner)
-    camera = static_cameras(run, match.folder.spec)[owner]
-    cameras = Camera.stack([camera])[np.zeros(len(frames), dtype=np.intp)]
-    width, height = camera.image_size.tolist()
+    views = image_views(Origin(run, match.registration), clip, tracks.frames, corrected=True)
+    view = next(view for view in views if view.name == owner)
+    cameras = Camera.stack([view.camera_in(frame) for frame in frames.tolist()])
+    width, height = view.camera.image_size.tolist()
+    tracks = replace(tracks, joints=view.at_images(tracks.joints))
 
     def pictures() -> Iterator[Image]:
         for picture in frame_pictures(store, match, owner, frames.tolist()):

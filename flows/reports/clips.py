@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from typing import Final
 
 import numpy as np
@@ -9,8 +10,15 @@ import numpy as np
 from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.pitch import PitchSpec
 from flows.reports.match_pictures import background_image, frame_picture, shown_pitch
-from flows.results.best_results import body_tracks, clip_title, joint_tracks, placed_joints
+from flows.results.best_results import (
+    Origin,
+    body_tracks,
+    clip_title,
+    joint_tracks,
+    placed_joints,
+)
 from flows.results.run_cameras import static_cameras
+from flows.results.tool_exports import ImageView, image_views
 from flows.stage import Match
 from flows.stages.filtering import seen_in
 from worldpose.dataset.contents import sample_evenly
@@ -145,25 +153,34 @@ def _plot_view(
     supports, None = those with a tracked detection.
     """
     row, index = place
-    name, camera = [*static_cameras(run, match.folder.spec).items()][index]
-    number = int(tracks.frames[row])
+    view = _static_views(run, match, clip, tracks)[index]
+    name, number = view.name, int(tracks.frames[row])
     detected = run[seen_in(run, match, name, clip)].sel(frame=number)
     tracked = run[f"tracking/{clip}"].sel(frame=number)["detection_index"].values[index]
     still = frame_picture(store, match, name, number)
     if still is None and row == 0:
         still = background_image(store, match, name)
     return plot_detections(
-        camera,
+        view.camera_in(number),
         ImageDetections(
             detected["boxes"].values, detected["keypoints"].values, tracked[tracked >= 0]
         ),
         ReconstructedPeople(
-            tracks.joints[row], tracks.person_ids, tracked >= 0 if seen is None else seen
+            view.at_images(tracks.joints)[row],
+            tracks.person_ids,
+            tracked >= 0 if seen is None else seen,
         ),
         still=still,
         pitch=shown_pitch(run, match),
         part=part,
     )
+
+
+def _static_views(run: Run, match: Match, clip: str, tracks: JointTracks) -> list[ImageView]:
+    """Return the images of static cameras at joints, with the changes that the run corrects."""
+    origin = Origin(run, match.registration)
+    views = image_views(origin, clip, tracks.frames, corrected=True)
+    return list(islice(views, len(origin.static_cameras)))
 
 
 def worst_views(run: Run, match: Match, clip: str, tracks: JointTracks) -> list[tuple[int, ...]]:
@@ -180,10 +197,10 @@ def worst_views(run: Run, match: Match, clip: str, tracks: JointTracks) -> list[
     tracked = run[f"tracking/{clip}"]["detection_index"].sel(frame=numbers)
     place = tracked.reindex(person=tracks.person_ids, fill_value=-1).values
     away = np.full(place.shape, np.nan)
-    for c, (name, camera) in enumerate(static_cameras(run, match.folder.spec).items()):
-        seen = run[seen_in(run, match, name, clip)]["keypoints"].reindex(frame=numbers).values
+    for c, view in enumerate(_static_views(run, match, clip, tracks)):
+        seen = run[seen_in(run, match, view.name, clip)]["keypoints"].reindex(frame=numbers).values
         own = np.take_along_axis(seen, np.maximum(place[:, c], 0)[..., None, None], axis=1)
-        found = camera.project(tracks.joints[rows].reshape(-1, 3)).reshape(own.shape)
+        found = view.project(tracks.joints)[rows]
         off = np.linalg.norm(own - found, axis=-1)
         height = np.ptp(found[..., 1], axis=-1)
         enough = (np.isfinite(off).sum(-1) >= MIN_JOINTS) & (place[:, c] >= 0)
@@ -202,11 +219,10 @@ def worst_views(run: Run, match: Match, clip: str, tracks: JointTracks) -> list[
 def disagreement_pictures(store: Store, run: Run, match: Match, clip: str) -> list[CaptionedImage]:
     """Crop the people whose detections and projected joints differ most, before and after."""
     tracks = joint_tracks(run, clip)
-    cameras = static_cameras(run, match.folder.spec)
+    views = _static_views(run, match, clip, tracks)
     pictures = []
     for row, index, person, percent in worst_views(run, match, clip, tracks):
-        name, camera = [*cameras.items()][index]
-        pixels = camera.project(tracks.joints[row, person])
+        name, pixels = views[index].name, views[index].project(tracks.joints)[row, person]
         side = _CROP_HEIGHTS * float(np.ptp(pixels[:, 1])) * np.array([1.6, 1.0])
         part = pixels.mean(axis=0) - 0.5 * side, side
         pictures.append(

@@ -43,7 +43,7 @@ def score_methods(
         match_in: reference camera in whose image tracks are matched (E3).
         body: body model that poses are applied to; None = the open body.
         first_frame: match frame of the methods' first image; None = the reference's first.
-        fps: frames per second; None = the match's, if there is one.
+        fps: frames per second; None = those that the reference states.
         seen_fps: name of a method to the frames per second of its input video, if not the clip's;
             the result is resampled to the clip's frames.
 
@@ -66,7 +66,7 @@ def score_methods(
     frames = truth.joints.frames
     first = first_frame if first_frame is not None else int(frames[0]) if len(frames) else 0
     model = find_body(body or OPEN_BODY)
-    rate = fps or (None if spec is None else spec.fps)
+    rate = fps or truth.fps
     seen_fps = seen_fps or {}
     _require_scored(named, seen_fps)
     scores = []

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Integers
+from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.conventions import COCO17
 from data_contracts.match import MatchSpec, Registration
 from data_contracts.pitch import PitchSpec
@@ -19,10 +19,9 @@ from data_contracts.tracking import Join, Track
 from flows.layers import pitch_of, pitch_of_run
 from flows.overview import read_summary
 from flows.results.run_cameras import (
-    BROADCAST,
+    TRIANGULATED,
     broadcast_unit,
     broadcast_views,
-    camera_in_frames,
     clip_of,
     static_cameras,
 )
@@ -199,7 +198,9 @@ def joint_tracks(
         joints = perceived_joints(joints, result["joint_offsets"].values)
     kind = 1 if stages[0] not in BODY_STAGES else 2 if definition == "detector" else 3
     source = np.where(np.isfinite(joints[..., 0]), kind, 0)
+    no_body = None
     if best and fitted and definition == "detector":
+        no_body = (source == 0).all(axis=-1)
         ends = np.isin(np.arange(len(COCO17)), LIMB_ENDS) & (source > 0)
         alone = (source == 0) & np.isfinite(seen["joints"].values[..., 0])
         for part, given, kind in ((ends, result, 3), (alone, seen, 1)):
@@ -216,7 +217,7 @@ def joint_tracks(
         identity_certainty=_identity_certainty(
             run, clip, result["frame"].values, result["person"].values
         ),
-        extra=_extra_tracks(run, f"{stages[0]}/{clip}", result, seen, definition),
+        extra=_extra_tracks(run, f"{stages[0]}/{clip}", result, seen, definition, no_body),
     )
 
 
@@ -239,11 +240,17 @@ def _identity_certainty(
 
 
 def _extra_tracks(
-    run: Run, unit: str, result: xr.Dataset, seen: xr.Dataset, definition: JointDefinition
+    run: Run,
+    unit: str,
+    result: xr.Dataset,
+    seen: xr.Dataset,
+    definition: JointDefinition,
+    alone: Flags | None,
 ) -> ExtraTracks | None:
     """Return the points besides COCO-17 of bodies or triangulated joints; None without any.
 
-    `result` is that of the unit, `seen` is the triangulation of the same people.
+    `result` is that of the unit, `seen` is the triangulation of the same people, whose points count
+    where people (frames, persons) have no body: `alone`; None = nowhere.
     """
     if "extra_joints" not in result:
         return None
@@ -257,8 +264,14 @@ def _extra_tracks(
         model = fitted_model(run, unit)
         offsets = result["extra_offsets"].values
         joints = joints + perceived_points(model, points, bodies, offsets)
-    views = seen["extra_views"].sel(point=list(points)).values.astype(np.int64)
-    return ExtraTracks(points, joints, result["extra_covariance"].values, views)
+    covariance, there = result["extra_covariance"].values, seen.sel(point=list(points))
+    if alone is not None:
+        part = np.isnan(joints[..., 0]) & alone[..., None]
+        joints = np.where(part[..., None], there["extra_joints"].values, joints)
+        given = there["extra_covariance"].values
+        covariance = np.where(part[..., None, None], given, covariance)
+    views = there["extra_views"].values.astype(np.int64)
+    return ExtraTracks(points, joints, covariance, views)
 
 
 def tracked_people(run: Run, clip: str) -> tuple[xr.Dataset, dict[int, Track]]:
@@ -415,20 +428,6 @@ def fitted_bodies(run: Run, clip: str) -> tuple[BodyModel, BodyParameters, NDArr
     return fitted_model(run, unit), poses, fits["person"].values
 
 
-def filmed_cameras(run: Run, clip: str) -> dict[str, Camera]:
-    """Return the moving cameras of a clip in the frames of its bodies, (frames,), by view.
-
-    Raises:
-        InputError: the run has no such camera.
-    """
-    todo = "Calibrate the clip's broadcast camera and run the match again. A match with static "
-    todo += "cameras alone has other formats: worldpose export --format joints."
-    views = broadcast_views(run, clip) or [require_result(run, f"{BROADCAST}{clip}", todo)]
-    bodies = bodies_unit(run, clip)
-    frames = run[bodies if bodies in run else broadcast_unit(run, views[0])]["frame"].values
-    return {view: camera_in_frames(run, view, frames) for view in views}
-
-
 def require_result(run: Run, unit: str, todo: str) -> str:
     """Return the name of a result that the run has.
 
@@ -478,15 +477,15 @@ def _with_tracked_joints(
     return joints, views
 
 
-def placed_joints(run: Run, clip: str) -> xr.Dataset:
-    """Return the best triangulated joints of one clip, with their contributing views.
+def placed_joints(run: Run, clip: str, stage: str | None = None) -> xr.Dataset:
+    """Return the joints of one clip that `stage` or the best one triangulated, with their views.
 
     Raises:
         UsageError: the run has none.
     """
-    for stage in ("retriangulation", "triangulation"):
-        if f"{stage}/{clip}" in run:
-            return _stage_joints(run, clip, stage)
+    for each in TRIANGULATED[stage == "triangulation" :]:
+        if f"{each}/{clip}" in run:
+            return _stage_joints(run, clip, each)
     raise UsageError(
         f"clip {clip}",
         expected="triangulated joints",

@@ -21,6 +21,7 @@ from flows.results import best_results
 from flows.results.best_results import Origin
 from flows.results.dataset import check, count
 from flows.results.export import keep_run
+from flows.results.tool_exports import filmed_cameras
 from worldpose.body.body_file import find_body
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BodyModel
@@ -157,7 +158,7 @@ def _write_clip(
     joints_file.write_joints(part / f"{name}.joints.npz", tracks)
     manifests.write_frame_rates(part, {name: spec.fps})
     views, videos, images = {}, {}, {}
-    for view, camera in best_results.filmed_cameras(origin.run, clip).items():
+    for view, camera in filmed_cameras(origin, clip).items():
         label = name + view.removeprefix(clip)
         width, height = camera.image_size.reshape(-1, 2)[0].tolist()
         views[label] = width, height

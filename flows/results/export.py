@@ -18,14 +18,25 @@ from data_contracts.match import MatchSpec
 from data_contracts.pin import Pin
 from data_contracts.release import BaselineSettings, ReleasedClip, ReleaseManifest
 from flows.results import best_results
-from flows.results.outputs import RELEASE, VIEWER_SUFFIX, record_owner, require_own, write_whole
+from flows.results.outputs import (
+    RELEASE,
+    VIEWER_SUFFIX,
+    own_whole,
+    write_whole,
+)
 from flows.results.run_cameras import (
     broadcast_views,
     estimated_pitch,
     moving_cameras,
     static_cameras,
+    view_changes,
 )
-from flows.results.tool_exports import TOOL_EXPORTS, export_alphapose, export_coco
+from flows.results.tool_exports import (
+    TOOL_EXPORTS,
+    export_alphapose,
+    export_coco,
+    filmed_cameras,
+)
 from worldpose.dataset import manifest as manifests
 from worldpose.errors import InputError, UsageError, unknown_name
 from worldpose.formats import challenge
@@ -40,7 +51,7 @@ from worldpose.formats.tables import write_positions
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_fit import fit_brown_lens
 from worldpose.geometry.lens_models import LensModel
-from worldpose.ingest.footage import image_clock, unit_frames
+from worldpose.ingest.footage import image_clock
 from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.runs import pin_run, read_pin
@@ -49,6 +60,8 @@ from worldpose.video.files import write_video
 
 LENS_ERRORS = "lens_errors.json"
 """Largest differences of the lenses in cameras/ from those of the run [px]."""
+CAMERA_CHANGES = "camera_changes.json"
+"""How the views of static cameras change within each clip; files in cameras/ are from before."""
 PITCH_SPACING = 0.5
 """Spacing of the points in pitch_points.txt [m]."""
 
@@ -64,24 +77,32 @@ def export_joints(origin: best_results.Origin, out: Path) -> Iterator[Path]:
 def export_worldpose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     """Write `poses/<clip>.npz` and `cameras/<broadcast view or static camera>.npz` (X3).
 
-    A clip without people has cameras alone. Other lenses than Brown's are fitted by it;
-    `lens_errors.json` states the largest error.
+    A clip without people has cameras alone. A moving camera of another frame rate than the match is
+    left out. Other lenses than Brown's are fitted by it; `lens_errors.json` states the largest
+    error, and `camera_changes.json` how static cameras change within a clip.
 
     Raises:
         InputError: a clip has people and no bodies.
     """
+    with_people = best_results.find_clips(origin.run.record)
+    others = bool(with_people or origin.static_cameras)
     for clip in best_results.all_clips(origin.run):
-        if clip in best_results.find_clips(origin.run.record):
+        if clip in with_people:
             model, poses, _ = best_results.fitted_bodies(origin.run, clip)
             path = out / "poses" / f"{clip}.npz"
             write_poses(path, poses, model.name)
             yield path
         filmed = broadcast_views(origin.run, clip)
-        moving = best_results.filmed_cameras(origin.run, clip) if filmed else {}
+        moving = filmed_cameras(origin, clip, leave_out=others) if filmed else {}
         for view, camera in moving.items():
             path = out / "cameras" / f"{view}.npz"
             write_moving_camera(path, camera)
             yield path
+    found = {clip: view_changes(origin.run, clip) for clip in best_results.all_clips(origin.run)}
+    if told := {clip: [each.model_dump() for each in own] for clip, own in found.items() if own}:
+        path = out / CAMERA_CHANGES
+        path.write_text(json.dumps(told, indent=1), encoding="utf-8")
+        yield path
     errors: dict[str, dict[str, str | float]] = {}
     for name, camera in origin.static_cameras.items():
         path = out / "cameras" / f"{name}.npz"
@@ -160,28 +181,9 @@ def _filmed(origin: best_results.Origin) -> dict[str, tuple[str, Camera]]:
     found: dict[str, tuple[str, Camera]] = {}
     for clip in origin.clips:
         best_results.fitted_bodies(origin.run, clip)
-        cameras = _of_one_rate(origin, clip)
+        cameras = filmed_cameras(origin, clip)
         found |= {view: (clip, camera) for view, camera in cameras.items()}
     return found
-
-
-def _of_one_rate(origin: best_results.Origin, clip: str) -> dict[str, Camera]:
-    """Return the moving cameras of a clip, by view; the rows of these formats are their images.
-
-    Raises:
-        InputError: a camera has another frame rate than the match.
-    """
-    cameras = best_results.filmed_cameras(origin.run, clip)
-    for view in cameras:
-        if (rate := unit_frames(origin.spec, view).rate) != 1.0:
-            raise InputError(
-                f"view {view}",
-                expected="the frame rate of the match, as the format has a row for each image",
-                found=f"{rate * origin.spec.fps:g} images per second, and {origin.spec.fps:g} "
-                "frames of the match",
-                todo="Set fps of the match to the camera's, or convert its video.",
-            )
-    return cameras
 
 
 def export_tracks(origin: best_results.Origin, out: Path) -> Iterator[Path]:
@@ -200,7 +202,7 @@ def export_slahmr_cameras(origin: best_results.Origin, out: Path) -> Iterator[Pa
     """Write `slahmr/cameras/<view>/shot-0/cameras.npz`, and the paper's settings."""
     yield _write_baseline_settings(out)
     for clip in best_results.all_clips(origin.run) or origin.clips:
-        for view, camera in _of_one_rate(origin, clip).items():
+        for view, camera in filmed_cameras(origin, clip).items():
             path = out / "slahmr" / "cameras" / view / "shot-0" / "cameras.npz"
             write_slahmr_cameras(path, camera)
             yield path
@@ -294,8 +296,6 @@ OF_CAMERAS = ("worldpose", "slahmr-cameras")
 """Formats that hold cameras without people; the second one of broadcast cameras alone."""
 CLASHING = {"worldpose", "challenge", "challenge-2025"}
 """Formats with the same file names; a folder can hold one of them."""
-SHARED = {manifests.FRAME_RATES, manifests.KINDS}
-"""Files to which exports of further clips are added."""
 COUNTED = {"joints", *CLASHING}
 """Formats that `check` and `statistics` read, and that lack the frame rate."""
 
@@ -339,10 +339,10 @@ def export(
     match_id = origin.spec.match_id
 
     def claim(folder: Path, drafts: Mapping[str, Path]) -> None:
-        require_own(folder, drafts, (match_id,), overwrite=overwrite)
-        record_owner(folder, drafts, match_id)
+        clips = best_results.all_clips(origin.run)
+        own_whole(folder, drafts, clips, (match_id,), overwrite=overwrite)
 
-    return write_whole(out, write, claim, SHARED)
+    return write_whole(out, write, claim)
 
 
 def forms_without_people(run: Run, spec: MatchSpec) -> tuple[str, ...]:
@@ -451,9 +451,10 @@ def release(
 
     def claim(folder: Path, drafts: Mapping[str, Path]) -> None:
         released = f"{RELEASE}{name} of {spec.match_id}"
-        require_own(folder, drafts, (released, spec.match_id), overwrite=False)
+        clips, owners = best_results.all_clips(origin.run), (released, spec.match_id)
+        own_whole(folder, drafts, clips, owners, overwrite=False, record=False)
 
-    return write_whole(out, lambda place: _write_release(origin, forms, place, ours), claim, SHARED)
+    return write_whole(out, lambda place: _write_release(origin, forms, place, ours), claim)
 
 
 def _write_release(

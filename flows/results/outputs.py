@@ -12,7 +12,7 @@ from typing import Final
 
 from pydantic import TypeAdapter, ValidationError
 
-from worldpose.dataset.manifest import MANIFEST, read_manifest
+from worldpose.dataset.manifest import FRAME_RATES, KINDS, MANIFEST, read_manifest
 from worldpose.errors import InputError
 from worldpose.formats.files import FULL, whole_file
 
@@ -22,6 +22,8 @@ VIEWER_SUFFIX: Final = ".html"
 """An output that ends so is one viewer file, not a folder."""
 RELEASE: Final = "release "
 """Begins the owner of released files, which nothing replaces."""
+SHARED: Final = frozenset({FRAME_RATES, KINDS})
+"""Files to which exports of further clips are added."""
 _OWNERS: Final = TypeAdapter(dict[str, str])
 
 
@@ -67,9 +69,71 @@ def require_own(
         )
 
 
-def record_owner(folder: Path, names: Mapping[str, Path | None], owner: str) -> None:
-    """Record the owner of files in a folder."""
-    owners = {**read_owners(folder), **dict.fromkeys(names, owner)}
+def own_whole(
+    folder: Path,
+    drafts: Mapping[str, Path],
+    clips: Collection[str],
+    owners: tuple[str, ...],
+    *,
+    overwrite: bool,
+    record: bool = True,
+) -> None:
+    """Record the first owner of files and of clips' entries in shared ones; or refuse.
+
+    Raises:
+        InputError: as `require_own`; or an entry would change that files of another match have.
+    """
+    files = {name: draft for name, draft in drafts.items() if name not in SHARED}
+    require_own(folder, files, owners, overwrite=overwrite)
+    shared = {name: drafts[name] for name in SHARED & drafts.keys()}
+    entries = _own_entries(folder, shared, clips, owners, overwrite=overwrite)
+    if record:
+        record_owner(folder, files, owners[0], entries)
+
+
+def _own_entries(
+    folder: Path,
+    drafts: Mapping[str, Path],
+    clips: Collection[str],
+    owners: tuple[str, ...],
+    *,
+    overwrite: bool,
+) -> dict[str, str]:
+    """Return the owners of these clips' entries in shared files, as `FILE: CLIP`.
+
+    An entry counts for all files of a clip of this name, so equal ones have several owners.
+    """
+    known, found = read_owners(folder), {}
+    for name, draft in drafts.items():
+        path = folder / name
+        old, new = (json.loads(f.read_bytes()) if f.is_file() else {} for f in (path, draft))
+        for clip in sorted(new.keys() & set(clips)):
+            # Earlier versions recorded no entries.
+            of_clip = {own for file, own in known.items() if f"/{clip}." in f"/{file}"}
+            those = of_clip or set(known.values())
+            before = owners[0] if those and those <= {*owners} else "unknown origin"
+            before = known.get(f"{name}: {clip}", before) if clip in old else owners[0]
+            other, same = before not in owners, old.get(clip, new[clip]) == new[clip]
+            if other and not same and (not overwrite or before.startswith(RELEASE)):
+                raise InputError(
+                    f"{path}: {clip}",
+                    expected=f"{new[clip]}, or no files of another match's clip of this name",
+                    found=f"{old[clip]}, of {before}",
+                    todo="Choose another folder, or rename the clip. Nothing was written.",
+                )
+            both = before if owners[0] in before.split(" and ") else f"{before} and {owners[0]}"
+            found[f"{name}: {clip}"] = both if same else owners[0]
+    return found
+
+
+def record_owner(
+    folder: Path,
+    names: Mapping[str, Path | None],
+    owner: str,
+    entries: Mapping[str, str] | None = None,
+) -> None:
+    """Record the owner of files in a folder, and those of entries in shared files."""
+    owners = {**read_owners(folder), **dict.fromkeys(names, owner), **(entries or {})}
     with whole_file(folder / OWNERS) as draft:
         draft.write_text(json.dumps(owners, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
@@ -104,13 +168,11 @@ def write_whole(
     out: Path,
     write: Callable[[Path], list[Path]],
     claim: Callable[[Path, Mapping[str, Path]], None],
-    shared: Collection[str],
 ) -> list[Path]:
     """Write files to a temporary place next to `out`, then move all of them; return them there.
 
     An error while they are written leaves `out` as it was. `claim` refuses to replace files of a
-    folder, given their drafts by name. Files with a `shared` name have no owner, and this call adds
-    to them.
+    folder, given their drafts by name. This call adds to `SHARED` files, whose entries have owners.
 
     Raises:
         InputError: `out` cannot be written, or one of its files is a folder.
@@ -126,7 +188,7 @@ def write_whole(
             place = Path(workshop) / out.name
             if not is_file:
                 place.mkdir()
-                for name in shared:
+                for name in SHARED:
                     if (out / name).is_file():
                         shutil.copyfile(out / name, place / name)
             try:
@@ -149,7 +211,6 @@ def write_whole(
                 {
                     target.relative_to(above_files).as_posix(): path
                     for path, target in targets.items()
-                    if target.name not in shared
                 },
             )
             for path, target in targets.items():

@@ -7,12 +7,15 @@ from collections.abc import Collection
 from data_contracts.arrays import Integers
 from data_contracts.match import MatchSpec
 from data_contracts.pitch import PitchSpec
+from data_contracts.triangulation import CameraChange
 from worldpose.geometry.cameras import Camera, camera_from_arrays
 from worldpose.static_calibration.venue import Venue, join_cameras
 from worldpose.store.store import Run
 
 ADJUSTED = "bundle_adjustment/cameras"
 BROADCAST = "broadcast_calibration/"
+TRIANGULATED = ("retriangulation", "triangulation")
+"""Stages that place joints and find how cameras change within a clip, the best first."""
 
 
 def broadcast_views(run: Run, clip: str | None = None) -> list[str]:
@@ -30,6 +33,13 @@ def broadcast_cameras(run: Run, clip: str | None = None) -> dict[str, Camera]:
 def clip_of(run: Run, view: str) -> str:
     """Return the clip of a broadcast view with a calibrated camera."""
     return str(run[f"{BROADCAST}{view}"].attrs["clip_id"])
+
+
+def view_changes(run: Run, clip: str, stage: str | None = None) -> list[CameraChange]:
+    """Return how views of static cameras change within a clip, as `stage` or the best one found."""
+    names = (f"{each}/{clip}" for each in TRIANGULATED[stage == "triangulation" :])
+    stated = next((run[name].attrs["changes"] for name in names if name in run), ())
+    return [each for each in map(CameraChange.model_validate, stated) if each.kind == "view"]
 
 
 def broadcast_unit(run: Run, view: str) -> str:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Integers
 from data_contracts.conventions import COCO17
@@ -17,15 +19,18 @@ from data_contracts.run import BODY_STAGES, JOINT_STAGES
 from data_contracts.triangulation import CameraChange
 from flows.results import best_results
 from flows.results.run_cameras import (
+    BROADCAST,
+    broadcast_unit,
     broadcast_views,
     camera_in_frames,
     estimated_pitch,
     moving_cameras,
+    view_changes,
 )
 from worldpose.body.body_file import is_open_body
 from worldpose.body.keypoints import HALPE26, fold_keypoints
 from worldpose.body.occlusions import hidden_joints
-from worldpose.errors import UsageError
+from worldpose.errors import InputError, UsageError
 from worldpose.formats import motion_capture
 from worldpose.formats.c3d_file import write_c3d
 from worldpose.formats.gltf_file import AnimatedBody, write_gltf
@@ -42,10 +47,18 @@ from worldpose.geometry.cameras import Camera
 from worldpose.ingest.clock import remaining_offset
 from worldpose.ingest.footage import image_clock, unit_frames
 from worldpose.store.store import Run
-from worldpose.triangulation.camera_changes import move_on
+from worldpose.triangulation.camera_changes import (
+    changed_camera,
+    describe_change,
+    left_out_frames,
+    move_on,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+LOG = logging.getLogger("worldpose.export")
 
 
 def describe_clip(origin: best_results.Origin, clip: str) -> dict[str, str]:
@@ -68,6 +81,10 @@ def describe_clip(origin: best_results.Origin, clip: str) -> dict[str, str]:
         else "joints without a contributing camera come from the motion or the rest of the body",
         "licence": origin.licence or "not stated: ask the owner of the recording",
     }
+    if changes := view_changes(origin.run, clip, origin.stage):
+        notes["camera_changes"] = "cameras are as before their changes. " + "; ".join(
+            describe_change(change) for change in changes
+        )
     unit = best_results.bodies_unit(origin.run, clip)
     if unit in origin.run:
         model = str(origin.run[unit].attrs["body_model"])
@@ -118,80 +135,162 @@ def _joint_definition(origin: best_results.Origin, clip: str, stage: str) -> str
 
 
 def export_coco(origin: best_results.Origin, out: Path) -> Iterator[Path]:
-    """Write `<camera or broadcast view>.json`, in `<clip>/` if there are several clips."""
+    """Write `<camera or broadcast view>.json`, in `<clip>/` if there are several clips.
+
+    A camera whose views the run leaves out in the whole clip has no file.
+    """
     for clip in origin.clips:
         tracks = origin.tracks(clip)
-        frames = tracks.frames.astype(np.int64)
-        for name, camera, number, late, move in _views(origin, clip, frames):
-            shown = replace(tracks, joints=_at_images(tracks.joints, late))
-            if name in origin.static_cameras:
-                placed = best_results.placed_joints(origin.run, clip)
-                seen = placed["inliers"].sel(camera=name).values
+        for view in image_views(origin, clip, tracks.frames):
+            shown = replace(tracks, joints=view.at_images(tracks.joints))
+            if view.name in origin.static_cameras:
+                placed = best_results.placed_joints(origin.run, clip, origin.stage)
+                seen = placed["inliers"].sel(camera=view.name).values
             else:
-                seen = ~hidden_joints(shown.joints, camera)
-            path = (out if len(origin.clips) == 1 else out / clip) / f"{name}.json"
-            motion_capture.write_json(
-                path,
-                motion_capture.coco_dataset(name, camera, shown, seen, number=number, move=move),
+                seen = ~hidden_joints(shown.joints, view.camera)
+            if not view.is_used(clip):
+                continue
+            path = (out if len(origin.clips) == 1 else out / clip) / f"{view.name}.json"
+            labels = motion_capture.coco_dataset(
+                view.name, view.camera, shown, seen, number=view.number, move=view.move
             )
+            motion_capture.write_json(path, labels)
             yield path
 
 
 def export_alphapose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
-    """Write `alphapose/<clip>/<camera or broadcast view>.json` of fitted bodies."""
+    """Write `alphapose/<clip>/<camera or broadcast view>.json` as `export_coco`."""
     for clip in origin.clips:
         model, poses, persons = best_results.fitted_bodies(origin.run, clip)
         at_frames = fold_keypoints(model, HALPE26)(poses).swapaxes(0, 1)
         frames = origin.run[best_results.bodies_unit(origin.run, clip)]["frame"].values
-        for name, camera, number, late, move in _views(origin, clip, frames.astype(np.int64)):
-            points = _at_images(at_frames, late)
-            pixels = camera.project(points.reshape(len(points), -1, 3))
-            pixels = move(pixels.reshape(*points.shape[:3], 2))
-            hidden = hidden_joints(points, camera)
-            path = out / "alphapose" / clip / f"{name}.json"
+        for view in image_views(origin, clip, frames):
+            if not view.is_used(clip):
+                continue
+            points = view.at_images(at_frames)
+            hidden = hidden_joints(points, view.camera)
+            path = out / "alphapose" / clip / f"{view.name}.json"
             path.parent.mkdir(parents=True, exist_ok=True)
-            motion_capture.write_json(
-                path, motion_capture.alphapose_results(pixels, hidden, persons, camera, number)
+            labels = motion_capture.alphapose_results(
+                view.project(points), hidden, persons, view.camera, view.number
             )
+            motion_capture.write_json(path, labels)
             yield path
 
 
-def _views(
-    origin: best_results.Origin, clip: str, frames: Integers
-) -> Iterator[tuple[str, Camera, Integers, Floats, Callable[[Floats], Floats]]]:
-    """Yield name, camera, own frames, how late these are, and where pixels move, of each view.
+def filmed_cameras(
+    origin: best_results.Origin, clip: str, *, leave_out: bool = False
+) -> dict[str, Camera]:
+    """Return the moving cameras of a clip in the frames of its bodies, (frames,), by view.
 
-    The images are later than the match frames [match frame]; a moving camera is that of the image.
+    They are for formats whose rows are images. With `leave_out`, a warning names the cameras of
+    another frame rate, which are left out.
+
+    Raises:
+        InputError: the run has no such camera, or one of another frame rate than the match.
     """
-    cameras = origin.static_cameras
-    stated = best_results.placed_joints(origin.run, clip).attrs["changes"] if cameras else ()
-    changes = [CameraChange.model_validate(each) for each in stated]
-    for name, camera in cameras.items():
-        own = [each for each in changes if (each.camera, each.kind) == (name, "view")]
+    run, found = origin.run, {}
+    todo = "Calibrate the clip's broadcast camera and run the match again. A match with static "
+    todo += "cameras alone has other formats: worldpose export --format joints."
+    views = broadcast_views(run, clip)
+    views = views or [best_results.require_result(run, f"{BROADCAST}{clip}", todo)]
+    bodies = best_results.bodies_unit(run, clip)
+    frames = run[bodies if bodies in run else broadcast_unit(run, views[0])]["frame"].values
+    for view in views:
+        if (rate := unit_frames(origin.spec, view).rate) == 1.0:
+            found[view] = camera_in_frames(run, view, frames)
+            continue
+        error = InputError(
+            f"view {view}",
+            expected="the frame rate of the match, as the format has a row for each image",
+            found=f"{rate * origin.spec.fps:g} images per second, and {origin.spec.fps:g} "
+            "frames of the match",
+            todo="Set fps of the match to the camera's, or convert its video.",
+        )
+        if not leave_out:
+            raise error
+        LOG.warning("this camera is left out: %s", error)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class ImageView:
+    """Images of a camera in consecutive match frames of a clip.
+
+    Attributes:
+        name: the camera or the broadcast view.
+        camera: a static camera, or that of each image (frames,).
+        frame: (frames,) match frames.
+        number: (frames,) the camera's own frames; -1 where the run leaves its views out.
+        late: (frames,) how much later than the match frames the images are [match frame].
+        changes: changes of the view within the clip.
+    """
+
+    name: str
+    camera: Camera
+    frame: Integers
+    number: Integers
+    late: Floats
+    changes: Sequence[CameraChange] = ()
+
+    def is_used(self, clip: str) -> bool:
+        """Return whether the run uses an image of this view; warn if not."""
+        if is_unused := bool(left_out_frames(self.changes, self.frame).all()):
+            text = "clip %s: no labels of camera %s, whose views the run leaves out"
+            LOG.warning(text, clip, self.name)
+        return not is_unused
+
+    def at_images(self, points: Floats) -> Floats:
+        """Return points (frames, ...) at the moments of the images.
+
+        x(t) = x(f) + (t - f) v, with the step v per frame to the next frame if t > f, else from the
+        one before; the other one, or none, where that is not known.
+        """
+        if not self.late.any():
+            return points
+        step = np.diff(points, axis=0)
+        gap = np.full((1, *points.shape[1:]), np.nan)
+        ahead, back = np.concatenate([step, gap]), np.concatenate([gap, step])
+        share = self.late.reshape(-1, *(1,) * (points.ndim - 1))
+        speed, other = np.where(share > 0, ahead, back), np.where(share > 0, back, ahead)
+        speed = np.where(np.isfinite(speed), speed, other)
+        return np.asarray(points + share * np.where(np.isfinite(speed), speed, 0.0))
+
+    def move(self, pixels: Floats) -> Floats:
+        """Return pixels (frames, ..., 2) of the unchanged camera where the images show them."""
+        return move_on(pixels, self.frame, self.camera, self.changes)
+
+    def camera_in(self, frame: int) -> Camera:
+        """Return a static camera as it is in a match frame."""
+        return changed_camera(self.camera, frame, self.changes)
+
+    def project(self, points: Floats) -> Floats:
+        """Return pixels (frames, ..., 2) of points (frames, ..., 3) [m] at the images' moments."""
+        pixels = self.camera.project(points.reshape(len(points), -1, 3))
+        return self.move(pixels.reshape(*points.shape[:-1], 2))
+
+
+def image_views(
+    origin: best_results.Origin, clip: str, frame: NDArray[np.integer], *, corrected: bool = False
+) -> Iterator[ImageView]:
+    """Yield the views of all cameras in consecutive match frames of a clip, static ones first.
+
+    With `corrected`, only changes count that the run corrects, so that what it leaves out is shown.
+    """
+    frames = frame.astype(np.int64)
+    changes = view_changes(origin.run, clip, origin.stage)
+    changes = [each for each in changes if each.is_explained or not corrected]
+    for name, camera in origin.static_cameras.items():
+        own = [each for each in changes if each.camera == name]
         unit = unit_frames(origin.spec, name)
+        number = np.where(left_out_frames(own, frames), -1, unit.numbers(frames))
         late = remaining_offset(frames, unit.offset, unit.rate)
-        move = partial(move_on, frame=frames, camera=camera, changes=own)
-        yield name, camera, unit.numbers(frames), late, move
+        yield ImageView(name, camera, frames, number, late, own)
     for view in broadcast_views(origin.run, clip):
         clock = image_clock(origin.spec, view)
         row = frames - unit_frames(origin.spec, view).first
         camera = camera_in_frames(origin.run, view, frames)
-        yield view, camera, clock.number[row], clock.late[row], lambda pixels: pixels
-
-
-def _at_images(points: Floats, late: Floats) -> Floats:
-    """Return points (frames, ...) of consecutive frames `late` (frames,) [frame] after them.
-
-    x(t) = x(f) + (t - f) v, with the step v per frame to the next frame if t > f, else from the one
-    before; the other one, or none, where that is not known.
-    """
-    step = np.diff(points, axis=0)
-    gap = np.full((1, *points.shape[1:]), np.nan)
-    ahead, back = np.concatenate([step, gap]), np.concatenate([gap, step])
-    share = late.reshape(-1, *(1,) * (points.ndim - 1))
-    speed, other = np.where(share > 0, ahead, back), np.where(share > 0, back, ahead)
-    speed = np.where(np.isfinite(speed), speed, other)
-    return np.asarray(points + share * np.where(np.isfinite(speed), speed, 0.0))
+        yield ImageView(view, camera, frames, clock.number[row], clock.late[row])
 
 
 def export_markers(origin: best_results.Origin, out: Path) -> Iterator[Path]:

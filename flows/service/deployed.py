@@ -191,7 +191,7 @@ def ingest(plan: dict[str, Any]) -> list[str]:
         return runs.start(opened.match_id, priority=arrival.priority, key=key).flow_run
 
     decided = take_in(
-        Store.create(served.project),
+        Store.open(served.project),
         served.state_folder,
         served.inbox,
         served.settle_seconds,

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import lru_cache
 from itertools import count
 from pathlib import Path
 from typing import Any, Final
@@ -24,6 +25,7 @@ from flows.registering import register
 from flows.service.layout import PRIORITIES, StateFolder
 from flows.stage import Match
 from worldpose.errors import InputError, InternalError, StoreError, WorldposeError
+from worldpose.formats.files import read_yaml, sha256_of_file
 from worldpose.ingest.match_folder import unclicked_clips
 from worldpose.ingest.validation import require_local
 from worldpose.store.store import Store
@@ -117,9 +119,8 @@ def missing_of(path: Path) -> str:
         file = path / name
         if not file.is_file():
             return f"{name} of {SUMS} is not there"
-        with file.open("rb") as content:
-            if hashlib.file_digest(content, "sha256").hexdigest() != digest:
-                return f"{name} is not as {SUMS} says"
+        if sha256_of_file(file) != digest:
+            return f"{name} is not as {SUMS} says"
     return ""
 
 
@@ -160,6 +161,24 @@ def _entries(folder: Path, prefix: str, priority: Priority) -> Iterator[Entry]:
 
 def _is_match(folder: Path) -> bool:
     return (folder / "match.yaml").is_file()
+
+
+def match_id_in(file: Path) -> str | None:
+    """Return the id that a match.yaml states; None if it is unreadable or states none."""
+    try:
+        status = file.lstat()
+        if not stat.S_ISREG(status.st_mode):
+            return None
+        return _read_match_id(file, status.st_mtime_ns, status.st_ino)
+    except (OSError, WorldposeError):
+        return None
+
+
+@lru_cache(maxsize=10_000)
+def _read_match_id(file: Path, changed_ns: int, number: int) -> str | None:
+    content = read_yaml(file)
+    found = content.get("match_id") if isinstance(content, dict) else None
+    return found if isinstance(found, str) else None
 
 
 def _require_plain(name: str) -> None:
@@ -358,7 +377,10 @@ def _scan(state: StateFolder, inbox: Path, quiet: float) -> list[tuple[Entry, Ar
         names.add(entry.name)
         before = known.get(entry.name)
         if before is not None and before.state == "taken":
-            continue
+            # Only another id tells another match: people go on clicking in a folder taken in.
+            if match_id_in(entry.path / "match.yaml") in (None, before.match_id):
+                continue
+            before = None
         arrival, is_ready = _look_at(entry, before, quiet)
         if arrival != before:
             state.write_arrival(arrival)

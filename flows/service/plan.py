@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from secrets import token_urlsafe
 from typing import Final
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from pydantic import Field
 
@@ -134,6 +137,8 @@ class ServePlan(Record):
 SCHEDULED: Final = ("ingest", "reprocess")
 """Flows that run without parameters of a person."""
 CRON_FIELDS: Final = 5
+LOCALTIME: Final = Path("/etc/localtime")
+TIMEZONE: Final = Path("/etc/timezone")
 
 
 def parse_schedules(texts: Iterable[str]) -> dict[str, Schedule]:
@@ -165,10 +170,39 @@ def parse_schedules(texts: Iterable[str]) -> dict[str, Schedule]:
 
 
 def _local_timezone() -> str:
-    """Return the name of this machine's time zone; UTC if it has none."""
-    place = os.environ.get("TZ") or os.path.realpath("/etc/localtime")
-    name = place.rpartition("zoneinfo/")[2].lstrip(":")
-    return name if name and not Path(name).is_absolute() else "UTC"
+    """Return the name of this machine's time zone; UTC if it has none.
+
+    Raises:
+        UsageError: its times are not those of UTC, and no name of them is known.
+    """
+    given = os.environ.get("TZ", "").lstrip(":")
+    file = Path(given or LOCALTIME)
+    if not file.is_absolute():
+        return given
+    _, is_linked, name = os.path.realpath(file).rpartition("zoneinfo/")
+    if is_linked or not file.exists():
+        return name if is_linked else "UTC"
+    # As in a container: a copy of a zone's file, whose name another file can tell.
+    with suppress(OSError, ValueError, ZoneInfoNotFoundError):
+        with file.open("rb") as content:
+            offsets = _offsets(ZoneInfo.from_file(content))
+        if not any(offsets):
+            return "UTC"
+        name = TIMEZONE.read_text(encoding="utf-8").strip()
+        if _offsets(ZoneInfo(name)) == offsets:
+            return name
+    raise UsageError(
+        "--schedule",
+        expected="a time zone after the five fields",
+        found=f"none, and {file} does not tell the name of this machine's",
+        todo="Name it: write `0 3 * * * Europe/Berlin`.",
+    )
+
+
+def _offsets(zone: ZoneInfo) -> list[timedelta | None]:
+    """Return the offsets from UTC in the months of this year."""
+    year = datetime.now(UTC).year
+    return [datetime(year, month, 1, tzinfo=zone).utcoffset() for month in range(1, 13)]
 
 
 def _problem(cron: str, zone: str) -> str:

@@ -17,6 +17,7 @@ import psutil
 from data_contracts.operations import Heartbeat, QueuedRun
 from flows.progress import Reporter, format_duration
 from flows.service.layout import PRIORITIES
+from worldpose.formats.files import bytes_read
 from worldpose.store.paths import is_name
 from worldpose.store.run_queue import RunQueue, queue_of
 
@@ -73,15 +74,16 @@ def find_process(pid: int | None, argument: str) -> psutil.Process | None:
 def beating(queue: RunQueue, run: QueuedRun, inputs: Path | None = None) -> Iterator[None]:
     """Write heartbeats while the calling thread makes progress in the block.
 
-    Progress is processor time of this thread. While it waits for units, which have time limits
-    of their own, the process and the disks of the store and of the folder `inputs` must answer.
+    Progress is processor time of this thread, or bytes of files that any thread hashes. While it
+    waits for units, which have time limits of their own, the process and the disks of the store
+    and of the folder `inputs` must answer.
     """
     ended, clock = threading.Event(), _clock_of_this_thread()
 
     def write() -> None:
-        before, number = -1.0, 0
+        before, number = (-1.0, -1), 0
         while True:
-            now, (share, doing, left) = clock(), _describe(Reporter.current)
+            now, (share, doing, left) = (clock(), bytes_read()), _describe(Reporter.current)
             if now != before or left:
                 number += 1
                 said = Heartbeat(number=number, share=share, doing=doing, at=datetime.now(UTC))

@@ -176,6 +176,7 @@ def serve(plan: ServePlan, secrets: Secrets, ready: Callable[[], None], tell: Te
     for priority in PRIORITIES:
         (plan.inbox / ("" if priority == "normal" else priority)).mkdir(parents=True, exist_ok=True)
     state = plan.state_folder
+    state.folder.mkdir(parents=True, exist_ok=True)
     with state.only_one("serve", wait=False) as is_alone:
         if not is_alone:
             raise UsageError(

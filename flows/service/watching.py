@@ -53,7 +53,7 @@ LOG = logging.getLogger("worldpose.operations")
 
 def watch(plan: ServePlan) -> None:
     """Watch, and serve metrics, until this process ends."""
-    overview, state = Overview(Store.create(plan.project)), plan.state_folder
+    overview, state = Overview(Store.open(plan.project)), plan.state_folder
     dispatcher = AlertDispatcher(state, channels_of(os.environ, state.alert_settings))
     # Each at its own interval; a scan of the inbox takes a tenth of the time, however long it is.
     _start("looking at the inbox", INBOX_SECONDS, lambda: _look_at_inbox(plan), rest=9.0)
@@ -131,6 +131,7 @@ def _start(what: str, seconds: float, step: Callable[[], object], rest: float = 
 
 def _look_at_inbox(plan: ServePlan) -> None:
     """Ask for the intake of arrivals now, unless one that has not ended may find them."""
+    Store.open(plan.project)  # its disk may be away: then nothing is written in its place
     ready = watch_once(plan.state_folder, plan.inbox, plan.settle_seconds)
     runs = MatchRuns.of_plan(plan)
     if ready and all(run.state in ENDED for run in runs.queue.runs("queue/ingest")):

@@ -27,6 +27,7 @@ from worldpose.formats.calibration_forms import (
     is_of_sensor,
     read_calibration,
 )
+from worldpose.formats.calibration_unit import doubt_middle
 from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.formats.keypoint_files import read_people
 from worldpose.ingest.camera_videos import fit_to_video
@@ -269,8 +270,9 @@ def take_given(
             shutil.copyfile(file, folder / "detections" / f"{owner}{file.suffix.lower()}")
             notes += [f"{file.name}: 2D poses of {owner}", *describe_people({owner: read})]
     for owner, files in lenses.items():
-        import_lenses(files, folder, owner)
+        lens = import_lenses(files, folder, owner)[owner]
         notes.append(f"{', '.join(file.name for file in files)}: lens of {owner}")
+        notes += doubt_middle(owner, lens.principal_point_px, lens.image_size)
     if posed:
         where = posed.pop() if len(posed) == 1 else given
         notes += _take_calibration(where, folder, indexes, people)

@@ -20,6 +20,7 @@ from flows.layers import (
     project_layers,
     read_layer,
     read_layers,
+    say_unnamed_venues,
 )
 from flows.settings import known_settings, resolve, save_layer
 from flows.web.app_context import PageContext
@@ -66,7 +67,7 @@ def routes(context: PageContext) -> APIRouter:
                 for layer in [read_layer(store, name)]
             ],
             "in_force": [{"name": each, **in_force[each]} for each in in_force],
-            "problem": problem,
+            "problem": problem or say_unnamed_venues(store),
             "known": known_settings(),
         }
 

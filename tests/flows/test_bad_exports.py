@@ -6,14 +6,18 @@ import os
 import re
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import TINY, worldpose
 from test_release_formats import match_folder, origin, tracked
+from typer.testing import CliRunner
 
+from data_contracts.release import EXPORT_FORMATS, EXPORT_PURPOSES
+from flows.cli.app import app
 from flows.results import export as export_module
-from flows.results.export import EXPORTS, export
+from flows.results.export import CLASHING, COUNTED, EXPORTS, export
 from flows.results.outputs import OWNERS
 from worldpose.errors import InputError, UsageError, WorldposeError
 
@@ -195,3 +199,17 @@ def test_people_without_bodies_are_no_cameras_alone(match_folder, tmp_path, left
     with pytest.raises(InputError, match="results of body_fitting/A_1"):
         export(origin(match_folder, **results), ["worldpose"], tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_every_format_has_a_writer_and_is_named_in_the_help_and_the_reference():
+    help_text = CliRunner().invoke(app, ["export", "--help"], env={"COLUMNS": "200"}).output
+    help_text = re.sub(r"-\n\s+", "-", help_text)  # a line may end at a hyphen
+    page = (Path(__file__).parents[2] / "docs/reference/formats.md").read_text()
+    assert tuple(EXPORTS) == EXPORT_FORMATS
+    assert set(EXPORT_FORMATS) >= CLASHING | COUNTED
+    for name, purpose in EXPORT_PURPOSES.items():
+        assert f"{name:15} {purpose}\n" in help_text, name
+        assert f"- `{name}`: {purpose}" in page
+    for name in EXPORT_FORMATS:
+        assert re.search(rf"\b{name}\b(?!-)", help_text), name
+        assert f"| `{name}` |" in page

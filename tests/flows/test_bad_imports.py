@@ -224,3 +224,10 @@ def test_a_file_of_another_tool_replaces_none(tiny, tmp_path, names, expected):
     with pytest.raises(InputError, match=expected):
         take_given(Store.open_or_new(tmp_path / "store"), given, folder, {})
     assert {file: file.read_bytes() for file in folder.glob("*.toml")} == before
+
+
+def test_a_lens_whose_stated_size_contradicts_its_middle_is_doubted(lab):
+    lens = {"K": [[500, 0, 639], [0, 500, 479], [0, 0, 1]], "dist": [0] * 4, "size": [640, 480]}
+    (lab / "lens.json").write_text(json.dumps(lens))
+    result = run(*LENS.format("lens.json").replace("LAB", str(lab)).split())
+    assert "principal point of a is 639.0, 479.0, the middle of about 1279 x 959" in result.output

@@ -2,9 +2,7 @@
 
 import dataclasses
 import json
-import re
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,13 +11,14 @@ import pytest
 import xarray as xr
 from run_records import StubRun, match_spec
 from stand_ins import empty_store
-from typer.testing import CliRunner
 
-from data_contracts.release import EXPORT_FORMATS, EXPORT_PURPOSES, BaselineSettings
-from flows.cli.app import app
+from data_contracts.release import BaselineSettings
+from flows.reports import clips
 from flows.results import best_results
 from flows.results.best_results import Origin
-from flows.results.export import CLASHING, COUNTED, EXPORTS, export
+from flows.results.data_set_release import _write_clip
+from flows.results.export import EXPORTS, export
+from flows.results.tool_exports import image_views
 from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import CHALLENGE15, HALPE26, fold_keypoints
 from worldpose.body.model import BodyParameters
@@ -97,20 +96,6 @@ def write(form, run, out):
     return list(EXPORTS[form](run, out))
 
 
-def test_every_format_has_a_writer_and_is_named_in_the_help_and_the_reference():
-    help_text = CliRunner().invoke(app, ["export", "--help"], env={"COLUMNS": "200"}).output
-    help_text = re.sub(r"-\n\s+", "-", help_text)  # a line may end at a hyphen
-    page = (Path(__file__).parents[2] / "docs/reference/formats.md").read_text()
-    assert tuple(EXPORTS) == EXPORT_FORMATS
-    assert set(EXPORT_FORMATS) >= CLASHING | COUNTED
-    for name, purpose in EXPORT_PURPOSES.items():
-        assert f"{name:15} {purpose}\n" in help_text, name
-        assert f"- `{name}`: {purpose}" in page
-    for name in EXPORT_FORMATS:
-        assert re.search(rf"\b{name}\b(?!-)", help_text), name
-        assert f"| `{name}` |" in page
-
-
 def test_labels_are_where_people_are_at_the_moments_of_the_images(match_folder, tmp_path):
     moving = bodies()
     moving["transl"][:, :, 0] += 0.1 * np.arange(4)[:, None]
@@ -130,9 +115,8 @@ def test_labels_are_where_people_are_at_the_moments_of_the_images(match_folder, 
     np.testing.assert_allclose(places[0.4] - places[0.0], 0.4 * 0.1 * 4000 / 70, rtol=0.02)
 
 
-def test_labels_of_a_drifting_static_camera_are_at_its_images(match_folder, tmp_path):
-    moving = bodies()
-    moving["transl"][:, :, 0] += 0.1 * np.arange(4)[:, None]
+def static_rig(*changes, inliers=True):
+    """Results with camera north, 70 m in front of the centre spot, and changes of its view."""
     pose = Rigid(
         np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), np.r_[0.0, 2.0, 70.0]
     )
@@ -142,11 +126,112 @@ def test_labels_of_a_drifting_static_camera_are_at_its_images(match_folder, tmp_
         name: ((f"{name}_0", *(f"{name}_{n + 1}" for n in range(each.ndim - 1))), each)
         for name, each in arrays
     }
-    static = xr.Dataset(cameras, coords={"camera": ["north"]})
     known = tracked()
-    results = {name: known[name] for name in ("tracking__A_1", "triangulation__A_1")}
-    results["triangulation__A_1"].attrs["changes"] = []
-    results |= {"body_fitting__A_1": moving, "bundle_adjustment__cameras": static}
+    results = {name: known[name] for name in known if "broadcast" not in name}
+    whole = {"camera": "north", "kind": "view", "first_frame": 100, "frame_count": 4, "std": None}
+    placed = results["triangulation__A_1"].assign_coords(camera=["north"])
+    placed["inliers"] = (("frame", "camera", "person", "joint"), np.full((4, 1, 2, 17), inliers))
+    placed.attrs["changes"] = [whole | change for change in changes]
+    static = xr.Dataset(cameras, coords={"camera": ["north"]}, attrs={"surface": None})
+    return results | {"triangulation__A_1": placed, "bundle_adjustment__cameras": static}
+
+
+def test_images_that_a_run_leaves_out_are_no_labels_of_an_empty_pitch(
+    match_folder, tmp_path, caplog
+):
+    unknown = {"frame": None, "is_explained": False, "is_left_out": True}
+    nobody = static_rig()
+    nobody["body_fitting__A_1"]["joints"][:, :, :, 1] -= 200.0  # behind the camera
+    (path,) = write("coco", origin(match_folder, **nobody), tmp_path / "nobody")
+    labels = json.loads(path.read_text())
+    assert [each["id"] for each in labels["images"]] == [100, 101, 102, 103]
+    assert not labels["annotations"]
+    run = origin(match_folder, **static_rig(unknown | {"first_frame": 101, "frame_count": 2}))
+    (path,) = write("coco", run, tmp_path / "part")
+    assert [each["id"] for each in json.loads(path.read_text())["images"]] == [100, 103]
+    assert not caplog.messages
+    run = origin(match_folder, **static_rig(unknown))
+    for form in ("coco", "alphapose"):
+        assert not write(form, run, tmp_path / "none")
+        assert "no labels of camera north, whose views the run leaves out" in caplog.text
+        caplog.clear()
+
+
+def test_files_of_cameras_state_that_a_view_changes(match_folder, tmp_path):
+    run = origin(match_folder, **static_rig({"frame": 102, "shift_px": (30.0, 0.0)}))
+    written = {path.name: path for path in write("worldpose", run, tmp_path)}
+    assert json.loads(written["camera_changes.json"].read_text())["A_1"][0]["frame"] == 102
+    (scene,) = write("gltf", run, tmp_path)
+    assert b"camera north moves at frame 102, by 30 px" in scene.read_bytes()
+
+
+@pytest.mark.parametrize("is_explained", [True, False])
+def test_the_report_compares_views_as_the_run_corrects_them(
+    match_folder, tmp_path, monkeypatch, is_explained
+):
+    change = {"frame": 102, "shift_px": (30.0, 0.0), "is_explained": is_explained}
+    results = static_rig(change | {"is_left_out": not is_explained})
+    results["body_fitting__A_1"]["joints"] *= 0.1  # into the image
+    index = np.tile(np.arange(2), (4, 1, 1))
+    tracking = results["tracking__A_1"]
+    tracking["detection_index"] = (("frame", "camera", "person"), index)
+    moved = origin(match_folder, **static_rig(change | {"is_explained": True}))
+    joints = results["body_fitting__A_1"]["joints"].values
+    (view,) = image_views(moved, "A_1", FRAMES)
+    seen = xr.Dataset(
+        {"keypoints": (("frame", "detection", "joint", "axis"), view.project(joints))},
+        coords={"frame": FRAMES},
+    )
+    shown = view.camera_in(102).project(joints[2].reshape(-1, 3)).reshape(2, 17, 2)
+    np.testing.assert_allclose(shown, seen["keypoints"][2], atol=1e-6)
+    assert np.isfinite(shown[0]).all()
+    monkeypatch.setattr(clips, "seen_in", lambda *_: "detection/north")
+    run = origin(match_folder, **results, detection__north=seen)
+    match = SimpleNamespace(registration=run.registration)
+    found = clips.worst_views(run.run, match, "A_1", best_results.joint_tracks(run.run, "A_1"))
+    assert [row for row, *_, percent in found if percent] == ([] if is_explained else [3, 3])
+
+
+def test_scenes_have_the_lens_of_every_frame_of_a_zoom(match_folder, tmp_path):
+    results = tracked()
+    results["broadcast_calibration__A_1"]["distortion"][:, 0] = [-0.01, -0.02, -0.08, -0.15]
+    run = origin(match_folder, **results)
+    (path,) = write("gltf", run, tmp_path)
+    content = path.read_bytes()
+    nodes = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])["nodes"]
+    (about,) = (node["extras"] for node in nodes if "camera" in node)
+    lenses = about["distortion_k1_k2_p1_p2_k3_by_frame"]
+    # The camera is known from frame 99 to 102, the bodies from 100 to 103.
+    assert [lens and lens[0] for lens in lenses] == [-0.02, -0.08, -0.15, None]
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    from pxr import Usd
+
+    (path,) = write("usd", run, tmp_path)
+    stage = Usd.Stage.Open(str(path))
+    lens = stage.GetAttributeAtPath("/world/broadcast.distortion_k1_k2_p1_p2_k3")
+    assert [lens.Get(frame)[0] for frame in lens.GetTimeSamples()] == [-0.02, -0.08, -0.15]
+
+
+def test_labels_of_a_stage_have_its_own_flags(match_folder, tmp_path, monkeypatch):
+    results = static_rig(inliers=False)
+    results["body_fitting__A_1"]["joints"] *= 0.1  # into the image
+    again = static_rig()["triangulation__A_1"]
+    for each in (results["triangulation__A_1"], again):
+        each["joints"] *= 0.1
+    run = origin(match_folder, **results, retriangulation__A_1=again)
+    known = best_results.static_cameras
+    monkeypatch.setattr(best_results, "static_cameras", lambda run, spec, _: known(run, spec))
+    for stage, flag in (("triangulation", 1), ("retriangulation", 2), ("body_fitting", 2)):
+        (path,) = write("coco", replace(run, stage=stage), tmp_path / stage)
+        labels = json.loads(path.read_text())["annotations"]
+        assert {v for each in labels for v in each["keypoints"][2::3] if v} == {flag}, stage
+
+
+def test_labels_of_a_drifting_static_camera_are_at_its_images(match_folder, tmp_path):
+    moving = bodies()
+    moving["transl"][:, :, 0] += 0.1 * np.arange(4)[:, None]
+    results = static_rig()
+    results["body_fitting__A_1"] = moving
     run = origin(match_folder, **results)
     places = {}
     for offset in (0.0, [[0, 0.25]]):
@@ -215,7 +300,7 @@ def test_the_broadcast_camera_joins_the_release_layout_where_there_is_one(match_
     np.testing.assert_array_equal(np.isnan(camera.focal[:, 0]), [False, False, False, True])
 
 
-def test_other_methods_get_our_boxes_as_mot_lines(match_folder, tmp_path):
+def test_other_methods_get_our_boxes_as_mot_lines(match_folder, tmp_path, caplog):
     run = origin(match_folder, body_fitting__A_1=bodies(), broadcast_calibration__A_1=broadcast())
     written = write("tracks", run, tmp_path / "out")
     assert [path.name for path in written] == ["baseline_settings.json", "A_1.txt"]
@@ -238,6 +323,11 @@ def test_other_methods_get_our_boxes_as_mot_lines(match_folder, tmp_path):
     for form in ("tracks", "challenge", "slahmr-cameras"):
         with pytest.raises(InputError, match="found 25 images per second, and 50 frames"):
             write(form, run, tmp_path / "slower")
+    with_joints = replace(run, run=origin(match_folder, **tracked()).run)
+    with pytest.raises(InputError, match="found 25 images per second, and 50 frames"):
+        _write_clip(with_joints, "A_1", "m_A_1", "train", tmp_path / "released", "none")
+    assert [path.name for path in write("worldpose", run, tmp_path / "slower")] == ["A_1.npz"]
+    assert not (tmp_path / "slower" / "cameras").exists() and "view A_1" in caplog.text
     settings = BaselineSettings.model_validate_json(written[0].read_bytes())
     assert (settings.slahmr_max_num_tracks, settings.slahmr_chunk_frames) == (30, 100)
 
@@ -265,7 +355,7 @@ def tracked():
         fits[name] = placed[name]
     return {
         "tracking__A_1": xr.Dataset(coords=coordinates, attrs={"tracks": tracks}),
-        "triangulation__A_1": xr.Dataset(placed, coords=coordinates),
+        "triangulation__A_1": xr.Dataset(placed, coords=coordinates, attrs={"changes": []}),
         "body_fitting__A_1": fits,
         "broadcast_calibration__A_1": broadcast(),
     }
@@ -298,6 +388,53 @@ def test_files_for_tools_say_what_they_hold(match_folder, tmp_path):
     unstated = replace(run, licence=None)
     write("c3d", unstated, tmp_path / "unstated")
     assert b"not stated" in (tmp_path / "unstated/markers/A_1/person_003.c3d").read_bytes()
+
+
+def test_heels_and_toes_without_a_body_are_those_of_triangulation(match_folder):
+    results = tracked()
+    placed, fits = results["triangulation__A_1"], results["body_fitting__A_1"]
+    fits["joints"] = fits["joints"].copy()
+    fits["joints"][:, 1] = np.nan
+    for name in ("global_orient", "body_pose", "transl"):
+        fits[name][:, 1] = np.nan
+    fits["joint_offsets"] = (("joint", "axis_"), np.zeros((17, 3)))
+    fits["extra_offsets"] = (("point", "axis_"), np.zeros((1, 3)))
+    places = np.full((4, 2, 1, 3), 2.0)
+    for each in (placed, fits):
+        own = places if each is placed else np.where([[[[True]], [[False]]]], places, np.nan)
+        each["extra_joints"] = (("frame", "person", "point", "coordinate"), own)
+        square = ("frame", "person", "point", "coordinate", "coordinate_")
+        each["extra_covariance"] = (square, own[..., None] * 1e-4 * np.eye(3))
+    placed["extra_views"] = (("frame", "person", "point"), np.full((4, 2, 1), 3))
+    for name, each in (("triangulation__A_1", placed), ("body_fitting__A_1", fits)):
+        results[name] = each.assign_coords(point=["left_heel"])
+    run = origin(match_folder, **results).run
+    heels = best_results.joint_tracks(run, "A_1", definition="detector").extra
+    np.testing.assert_array_equal(heels.joints, places)
+    np.testing.assert_allclose(heels.covariance[:, 1, 0], np.tile(2e-4 * np.eye(3), (4, 1, 1)))
+    of_bodies = best_results.joint_tracks(run, "A_1").extra
+    np.testing.assert_array_equal(np.isnan(of_bodies.joints[0, :, 0, 0]), [False, True])
+
+
+def test_a_match_changes_no_frame_rate_of_another_matchs_files(match_folder, tmp_path):
+    run, out = origin(match_folder, **tracked()), tmp_path / "out"
+    rates = out / "frame_rates.json"
+
+    def other(**stated):
+        spec = run.spec.model_copy(update=stated)
+        return replace(run, registration=SimpleNamespace(spec=spec, folder=str(match_folder)))
+
+    export(run, ["joints"], out)
+    export(other(fps=25.0), ["joints"], out)  # corrected
+    assert json.loads(rates.read_text()) == {"A_1": 25.0}
+    with pytest.raises(InputError, match=r"A_1: expected 50.0, or no .* found 25.0, of m\."):
+        export(other(match_id="other"), ["worldpose"], out)
+    assert not (out / "poses").exists() and json.loads(rates.read_text()) == {"A_1": 25.0}
+    export(other(match_id="other", fps=25.0), ["worldpose"], out)  # of both
+    with pytest.raises(InputError, match=r"found 25.0, of m and other\."):
+        export(run, ["joints"], out)
+    export(run, ["joints"], out, overwrite=True)
+    assert json.loads(rates.read_text()) == {"A_1": 50.0}
 
 
 def test_filled_joints_are_flagged(match_folder, tmp_path):

@@ -352,15 +352,19 @@ def test_a_page_names_no_file_of_the_server_and_keeps_those_that_are_named(store
     assert save(**{"detection.detector": "model:rtdetr-v2-r18", "detection.stride": 3}) == 200
 
 
-def test_layers_are_kept_in_object_storage_too(bucket):
-    store = Store.create(f"{bucket}/layers")
-    write_layer(store, "venues/hall", {"lenses": [], "tracking.gate_m": 0.6})
-    write_layer(store, "project", {"iterations": "auto"})
-    assert layers.list_venues(store) == ("hall",)
-    assert resolve(layers.project_layers(store)).general.iterations == "auto"
-    write_layer(store, "project", {})
-    (entry,) = store.blobs.entries("settings")
-    assert entry.path == "settings/venues/hall.yaml"
+def test_a_stray_file_among_the_venues_closes_no_door(tmp_path):
+    store = Store.create(tmp_path)
+    write_layer(store, "venues/hall", {})
+    store.blobs.put("settings/venues/._arena.yaml", b"\0")
+    routes = page_settings.routes(SimpleNamespace(store=store)).routes
+    page = next(each.endpoint for each in routes if "GET" in each.methods)
+    assert page()["problem"] == ""
+    store.blobs.put("settings/venues/Köln Arena.yaml", b"")
+    found = page()
+    assert [each["layer"] for each in found["layers"]] == ["project", "venues/hall"]
+    assert "settings/venues/Köln Arena.yaml is not used: " in found["problem"]
+    answer = CliRunner().invoke(worldpose, ["settings", "--project", store.url])
+    assert (answer.exit_code, found["problem"] in answer.stderr) == (0, True)
 
 
 @pytest.mark.usefixtures("server")

@@ -1,7 +1,10 @@
 """How long units take and may take, and what a run tells a tracer."""
 
+import os
 import re
+import shutil
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -9,6 +12,7 @@ from command_line import TINY, succeed
 
 from flows.method import METHOD
 from flows.results import timings
+from flows.service import plan
 from flows.service.plan import parse_schedules
 from flows.settings import DEFAULT_MINUTES, parse_time_limits, seconds_of
 from tasks import tracing
@@ -87,6 +91,35 @@ def test_a_schedule_that_cannot_be_is_refused_before_anything_starts(text, said)
         parse_schedules([text])
     with pytest.raises(UsageError, match="twice"):
         parse_schedules(["reprocess=0 3 * * * UTC", "reprocess=0 4 * * * UTC"])
+
+
+def test_a_schedule_without_a_zone_has_that_of_the_machine_or_is_refused(tmp_path, monkeypatch):
+    zones = Path("/usr/share/zoneinfo/Europe")
+    if not zones.exists():
+        pytest.skip("no time zones are installed")
+    local, told = tmp_path / "localtime", tmp_path / "timezone"
+    monkeypatch.setattr(plan, "LOCALTIME", local)
+    monkeypatch.setattr(plan, "TIMEZONE", told)
+    monkeypatch.delenv("TZ", raising=False)
+
+    def zone():
+        return parse_schedules(["reprocess=0 3 * * *"])["reprocess"].timezone
+
+    assert zone() == "UTC"  # a slim image
+    shutil.copy(zones.parent / "UTC", local)
+    assert zone() == "UTC"
+    shutil.copy(zones / "Berlin", local)
+    for wrong in (None, "Etc/UTC\n", "no zone\n"):
+        if wrong:
+            told.write_text(wrong)
+        with pytest.raises(UsageError, match=re.escape("`0 3 * * * Europe/Berlin`")):
+            zone()
+    told.write_text("Europe/Berlin\n")
+    assert zone() == "Europe/Berlin"
+    told.unlink()
+    local.unlink()
+    local.symlink_to(zones / "Lisbon")
+    assert zone() == os.path.realpath(zones / "Lisbon").partition("zoneinfo/")[2]
 
 
 @pytest.fixture

@@ -1,6 +1,5 @@
 """An inbox in object storage: what is whole is copied once, and nothing leads out of the folder."""
 
-import shutil
 import uuid
 from datetime import UTC, datetime
 from pathlib import Path
@@ -8,6 +7,7 @@ from unittest.mock import Mock
 
 import pytest
 
+from data_contracts.operations import Arrival
 from flows.service.bucket import BucketInbox
 from flows.service.layout import StateFolder
 from worldpose.errors import UsageError
@@ -27,7 +27,7 @@ def arriving(bucket, tmp_path):
         objects.put(path, content)
 
     (tmp_path / "inbox").mkdir()
-    return f"{bucket}/{prefix}", put
+    return f"{bucket}/{prefix}", put, objects.delete
 
 
 def watched(arriving, tmp_path):
@@ -39,7 +39,7 @@ def files_of(folder):
 
 
 def test_a_match_is_copied_once_when_it_is_whole_and_quiet(arriving, tmp_path, small_match):
-    _, put = arriving
+    _, put, _ = arriving
     inbox = watched(arriving, tmp_path)
     for path in sorted(small_match.rglob("*.npz")):
         put(f"urgent/small/{path.relative_to(small_match).as_posix()}", path.read_bytes())
@@ -61,36 +61,73 @@ def test_a_match_is_copied_once_when_it_is_whole_and_quiet(arriving, tmp_path, s
 
 
 def test_what_was_mended_in_the_bucket_takes_the_place_of_its_copy(arriving, tmp_path, monkeypatch):
-    _, put = arriving
+    _, put, remove = arriving
     inbox = watched(arriving, tmp_path)
     put("m/match.yaml", b"contract: 0")
     put("m/old.npz")
     inbox.fetch(0.0, QUIET)
     assert inbox.fetch(10.0, QUIET) == ["m"]
     put("m/match.yaml", b"contract: 1\n")
+    remove("m/old.npz")  # the wrong file
     inbox.fetch(20.0, QUIET)
-    remove = shutil.rmtree
-
-    def remove_half(folder, **more):
-        if (old := Path(folder) / "old.npz").exists():
-            old.unlink()
-            raise KeyboardInterrupt
-        remove(folder, **more)
-
     with monkeypatch.context() as killed, pytest.raises(KeyboardInterrupt):
-        killed.setattr(shutil, "rmtree", remove_half)
+        killed.setattr(Path, "rename", Mock(side_effect=KeyboardInterrupt))
         inbox.fetch(30.0, QUIET)
     inbox = watched(arriving, tmp_path)
     inbox.fetch(40.0, QUIET)
     assert inbox.fetch(50.0, QUIET) == ["m"]
     assert (tmp_path / "inbox" / "m" / "match.yaml").read_bytes() == b"contract: 1\n"
-    assert files_of(tmp_path / "inbox") == {"m/match.yaml", "m/old.npz"}
+    assert files_of(tmp_path / "inbox" / "m") == {"match.yaml"}
+    (aside,) = (tmp_path / "inbox" / ".removed").iterdir()
+    assert files_of(aside) == {"match.yaml", "old.npz"}
+
+
+def test_a_match_taken_in_loses_nothing_by_the_bucket(arriving, tmp_path, caplog):
+    _, put, remove = arriving
+    inbox, state = watched(arriving, tmp_path), StateFolder(tmp_path / "operations")
+    put("m/match.yaml", b"match_id: a")
+    put("m/cam01.mp4", b"whole")
+    inbox.fetch(0.0, QUIET)
+    assert inbox.fetch(10.0, QUIET) == ["m"]
+    more = {"match_id": "a", "reason": "to be clicked", "changed_at": datetime.now(UTC)}
+    state.write_arrival(Arrival(name="m", state="taken", **more))
+    remove("m/cam01.mp4")
+    inbox.fetch(20.0, QUIET)
+    assert inbox.fetch(30.0, QUIET) == inbox.fetch(31.0, QUIET) == []
+    assert files_of(tmp_path / "inbox") == {"m/match.yaml", "m/cam01.mp4"}
+    assert caplog.text.count("1 of its files no more, as cam01.mp4") == 1
+    assert state.arrivals()["m"].reason.startswith("to be clicked; not copied again")
+    put("m/cam01.mp4", b"of another match")
+    put("m/match.yaml", b"match_id: b")
+    inbox.fetch(40.0, QUIET)
+    assert inbox.fetch(50.0, QUIET) == []
+    assert "taken in as a, and match_id in the bucket is b" in state.arrivals()["m"].reason
+    put("m/match.yaml", b"match_id: a # mended")
+    inbox.fetch(60.0, QUIET)
+    assert inbox.fetch(70.0, QUIET) == ["m"]
+    assert state.arrivals()["m"].reason == "to be clicked"
+
+
+def test_markers_of_folders_are_none_and_one_bad_match_stops_no_other(arriving, tmp_path, caplog):
+    _, put, _ = arriving
+    inbox = watched(arriving, tmp_path)
+    for path in ("bad/file", "bad/file/inside", "bad/match.yaml", "m/a.mp4", "m/match.yaml"):
+        put(path)
+    for path in ("m/videos", "m/empty"):
+        put(path, b"")
+    put("m/videos/cam01.mp4")
+    inbox.fetch(0.0, QUIET)
+    assert inbox.fetch(10.0, QUIET) == ["m"]
+    assert inbox.fetch(20.0, QUIET) == []
+    copied = {"match.yaml", "a.mp4", "videos/cam01.mp4", "empty"}
+    assert files_of(tmp_path / "inbox" / "m") == copied
+    assert caplog.text.count("bad is not taken") == 1
 
 
 def test_a_copy_that_was_changed_here_stays_until_it_is_moved_away(
     arriving, tmp_path, caplog, monkeypatch
 ):
-    _, put = arriving
+    _, put, _ = arriving
     inbox, copy = watched(arriving, tmp_path), tmp_path / "inbox" / "m"
     put("m/match.yaml", b"contract: 1")
     inbox.fetch(0.0, QUIET)
@@ -115,7 +152,7 @@ def test_a_copy_that_was_changed_here_stays_until_it_is_moved_away(
 
 
 def test_what_somebody_put_into_the_folder_is_left_alone(arriving, tmp_path, caplog):
-    _, put = arriving
+    _, put, _ = arriving
     (tmp_path / "inbox" / "m").mkdir()
     (tmp_path / "inbox" / "m" / "mine").touch()
     put("m/match.yaml")

@@ -6,10 +6,13 @@ import os
 import shutil
 import socket
 from multiprocessing import get_context
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+from flows.registering import find_match, open_for_review, open_match, open_stored
+from flows.service import deployed, watching
 from flows.service.inbox import (
     MOST_FILES,
     RefusalError,
@@ -20,6 +23,11 @@ from flows.service.inbox import (
     watch_once,
 )
 from flows.service.layout import StateFolder
+from flows.service.plan import ServePlan
+from flows.service.recovery import recover
+from worldpose.errors import InputError
+from worldpose.simulation.matches import MatchOptions, simulate_match
+from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.store.store import Store
 
 
@@ -83,6 +91,37 @@ def test_a_complete_match_is_taken_once_and_stays_where_it_is(desk, drop):
     assert (desk.look(), desk.look(), desk.take_in()) == (0, 0, [])
     (folder / "notes.txt").unlink()
     assert content(folder) == before
+
+
+def test_an_id_is_never_another_match_that_its_folder_holds_now(desk, drop):
+    folder = drop()
+    desk.look(), desk.look()
+    (taken,) = desk.take_in()
+    before = content(Path(desk.store.url))
+    text = (folder / "match.yaml").read_text()
+    (folder / "match.yaml").write_text(text.replace(taken.match_id, "other"))
+    shutil.copy(folder / "detections" / "cam01.npz", folder / "detections" / "cam00.npz")
+    for opening in (open_match, open_for_review):
+        with pytest.raises(InputError, match=f"expected {taken.match_id}, .* found other"):
+            opening(desk.store, taken.match_id)
+    assert open_stored(desk.store, taken.match_id).match_id == taken.match_id
+    assert content(Path(desk.store.url)) == before
+    assert find_match(desk.store, str(folder)).match_id == "other"
+
+
+def test_a_project_whose_disk_is_away_is_not_made_anew(desk, drop, tmp_path):
+    drop()
+    project = Path(desk.store.url).rename(tmp_path / "away").with_name("project")
+    plan = ServePlan(project=desk.store.url, inbox=desk.inbox, state=desk.state.folder, prefect="")
+    for step in (
+        lambda: deployed.ingest.fn(plan.model_dump(mode="json")),
+        lambda: watching.watch(plan),
+        lambda: watching._look_at_inbox(plan),
+        lambda: recover(plan),
+    ):
+        with pytest.raises((InputError, FileNotFoundError)):
+            step()
+        assert not project.exists()
 
 
 def test_a_growing_match_waits_until_nothing_has_changed(desk, drop, clock):
@@ -346,6 +385,22 @@ def test_what_is_taken_out_of_the_inbox_is_forgotten_unless_it_was_taken_in(desk
     shutil.rmtree(desk.inbox / "good")
     desk.look()
     assert set(desk.known()) == {"good"}
+
+
+def test_another_match_in_a_folder_of_a_known_name_is_taken_in(desk, drop):
+    folder, away = drop(), desk.inbox.with_name("away")
+    desk.look()
+    desk.take_in()
+    folder.rename(away)
+    desk.look()
+    away.rename(folder)  # the disk of the inbox was away
+    assert (desk.look(), desk.look(), desk.take_in()) == (0, 0, [])
+    folder.rename(away)
+    options = MatchOptions(duration=0.2, cameras=3, players=2, stills=False, video=False)
+    simulate_match(SCENARIOS["tiny"], 1, folder, options)
+    assert (desk.look(), desk.look()) == (0, 1)
+    (taken,) = desk.take_in()
+    assert (taken.state, len(desk.begun), len(desk.store.matches())) == ("taken", 2, 2)
 
 
 def take_in_and_count(folder, queue, kill):

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
 
@@ -23,6 +24,7 @@ from flows.service.health import _check_progress
 from flows.service.plan import ServePlan
 from flows.service.recovery import Liveness
 from flows.service.run_queue import beating, find_process
+from worldpose.formats.files import sha256_of_file
 from worldpose.store.blobs import LocalBlobs
 from worldpose.store.documents import seal
 from worldpose.store.integrity import repair, verify
@@ -135,6 +137,33 @@ def test_heartbeats_tell_progress_and_stop_without_it(queue, monkeypatch):
     thread.join()
     queue.change(run, "complete")
     assert queue.beat(run) is None
+
+
+def test_bytes_of_a_slow_disk_are_progress_until_it_stops(queue, monkeypatch, tmp_path):
+    monkeypatch.setattr(run_queue, "BEAT_SECONDS", 0.05)
+    run, disk, is_slow = queue.begin(queue.take(a_run()), "m"), tmp_path / "disk", threading.Event()
+    os.mkfifo(disk)
+
+    def register():
+        with beating(queue, run), ThreadPoolExecutor(1) as threads:
+            list(threads.map(sha256_of_file, [disk]))
+
+    def answer():
+        while not is_slow.wait(0.02):
+            os.write(written, b"video")
+
+    reader, writer = threading.Thread(target=register), threading.Thread(target=answer)
+    reader.start()
+    written = os.open(disk, os.O_WRONLY)
+    writer.start()
+    wait_until(lambda: queue.beat(run))
+    assert beats(queue, run, 1.0) > 1
+    is_slow.set()
+    writer.join()
+    time.sleep(0.3)
+    assert beats(queue, run, 1.0) == 0
+    os.close(written)
+    reader.join()
 
 
 COMPUTE = """

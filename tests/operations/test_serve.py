@@ -96,6 +96,7 @@ def test_a_second_service_of_a_project_and_an_absent_server_are_refused(tmp_path
 
     project = tmp_path / "project"
     state = StateFolder(project / "operations")
+    state.folder.mkdir(parents=True)
     with state.only_one("serve", wait=False):
         answer = worldpose("serve", "--project", project)
         assert answer.code == 2

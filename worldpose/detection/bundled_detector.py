@@ -7,9 +7,8 @@ other real footage fine-tuned or larger models may serve better. Needs torch.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Generator, Sequence
-from functools import partial
-from itertools import chain, islice
+from collections.abc import Generator, Sequence
+from itertools import chain, islice, pairwise
 from typing import Final
 
 import numpy as np
@@ -26,14 +25,12 @@ from worldpose.detection.enlargement import (
 )
 from worldpose.detection.interfaces import MIN_SCORE, People
 from worldpose.detection.net_inference import PlacedNet, QuantizedNet, Tensors, run_together
-from worldpose.detection.sampling import Frame, pad, place_frames, resize
+from worldpose.detection.sampling import Frame, View, pad, place_frames, resize, resized_shape
 from worldpose.detection.suppression import suppress
 
 NMS_IOU: Final = 0.7
 """Boxes with a larger intersection over union are of one person [1]."""
-ReadFrame = Callable[[], Frame]
-"""Returns an image that the net shall see."""
-Steps = Generator[Sequence[ReadFrame], list[People], People]
+Steps = Generator[Sequence[View], list[People], People]
 """Yields what the net shall see, gets the people there, and returns those of the frame."""
 
 
@@ -69,7 +66,7 @@ class BundledDetector:
         frames = place_frames(images, self._net.device)
         steps = [_search(frame, parts) for frame in frames]
 
-        def see(_: list[int], asked: list[Sequence[ReadFrame]]) -> list[list[People]]:
+        def see(_: list[int], asked: list[Sequence[View]]) -> list[list[People]]:
             views = list(chain.from_iterable(asked))
             most = 16 * self._net.batch  # bounds the memory of their maps
             starts = range(0, len(views), most)
@@ -78,30 +75,29 @@ class BundledDetector:
 
         return run_together(steps, see)
 
-    def _detect(self, views: Sequence[ReadFrame]) -> list[People]:
-        """Return the detections in images; the same person may be there twice."""
-        images = [view() for view in views]
+    def _detect(self, views: Sequence[View]) -> list[People]:
+        """Return the detections in views; the same person may be there twice."""
+        shapes = [resized_shape(view) for view in views]
         same = defaultdict[tuple[int, ...], list[int]](list)
-        for number, image in enumerate(images):
-            sides = (-(-side // self._multiple) * self._multiple for side in image.shape[:2])
-            same[tuple(sides)].append(number)
+        for number, shape in enumerate(shapes):
+            same[tuple(-(-n // self._multiple) * self._multiple for n in shape)].append(number)
         order, maps = list[int](), list[Tensors]()
-        for shape, numbers in same.items():
+        for sides, numbers in same.items():
             for start in range(0, len(numbers), self._net.batch):
                 some = numbers[start : start + self._net.batch]
                 order += some
-                maps.append(self._net(pad([images[number] for number in some], shape)))
+                maps.append(self._net(pad([views[number] for number in some], sides)))
         rows = decode_boxes(maps, MIN_SCORE).cpu().numpy().astype(np.float64)
+        ends = np.searchsorted(rows[:, 0], np.arange(len(order) + 1))
+        high = np.array(shapes)[order][rows[:, 0].astype(int)][:, [1, 0, 1, 0]] - 0.5
+        boxes = np.clip(rows[:, 1:5], -0.5, high)
+        real = np.all(boxes[:, 2:] - boxes[:, :2] > 1.0, axis=1)
         found: dict[int, People] = {}
-        for index, number in enumerate(order):
-            own = rows[rows[:, 0] == index]
-            if len(own) > 300:  # most people
-                own = own[np.argsort(-own[:, 5], kind="stable")[:300]]
-            height, width = images[number].shape[:2]
-            boxes = np.clip(own[:, 1:5], -0.5, np.array([width, height, width, height]) - 0.5)
-            real = np.all(boxes[:, 2:] - boxes[:, :2] > 1.0, axis=1)
-            found[number] = People(boxes[real], own[real, 5])
-        return [found[number] for number in range(len(images))]
+        for number, (first, end) in zip(order, pairwise(ends), strict=True):
+            best = first + np.argsort(-rows[first:end, 5], kind="stable")[:300]  # most people
+            best = best[real[best]]
+            found[number] = People(boxes[best], rows[best, 5])
+        return [found[number] for number in range(len(views))]
 
 
 def _search(frame: Frame, parts: Sequence[Part] | None) -> Steps:
@@ -110,19 +106,19 @@ def _search(frame: Frame, parts: Sequence[Part] | None) -> Steps:
         return (yield from _find_all(frame, parts))
     size = (frame.shape[1], frame.shape[0])
     # Half size shows people of full height in the training and of twice that height.
-    (sized,) = yield [partial(resize, frame, 0.5)]
+    (sized,) = yield [(frame, 0.5)]
     zoom = choose_reduction(restore_size(sized, size, 0.5))
     close = yield from _close_up(frame, float(sized.scores.max(initial=0.0)))
     if close < 1.0:
-        (people,) = yield [partial(resize, frame, close)]
+        (people,) = yield [(frame, close)]
         return restore_size(suppress(people, NMS_IOU), size, close)
     if zoom < 1.0:
-        people = yield from _find_all(resize(frame, zoom), None)
+        people = yield from _find_all(resize((frame, zoom)), None)
         return restore_size(people, size, zoom)
     return (yield from _find_all(frame, None))
 
 
-def _close_up(frame: Frame, usual: float) -> Generator[Sequence[ReadFrame], list[People], float]:
+def _close_up(frame: Frame, usual: float) -> Generator[Sequence[View], list[People], float]:
     """Return the reduction of a frame that people fill; 1 for other frames [1].
 
     People who fill a frame are as high at these reductions as in the training.
@@ -131,7 +127,7 @@ def _close_up(frame: Frame, usual: float) -> Generator[Sequence[ReadFrame], list
         return 1.0
     best, chosen = usual + 0.05, 1.0
     zooms = (0.25, 0.125, 0.0884, 0.0625)
-    found = yield [partial(resize, frame, zoom) for zoom in zooms]
+    found = yield [(frame, zoom) for zoom in zooms]
     for zoom, people in zip(zooms, found, strict=True):
         score = float(people.scores.max(initial=0.0))
         if score > best:
@@ -141,12 +137,11 @@ def _close_up(frame: Frame, usual: float) -> Generator[Sequence[ReadFrame], list
 
 def _find_all(frame: Frame, parts: Sequence[Part] | None) -> Steps:
     """Return the people in a frame, with passes over its parts."""
-    (found,) = yield [lambda: frame]
-    if parts is None:
-        for step in STEPS:
-            found = yield from _look_at(frame, found, find_small(found, frame.shape, step))
-    else:
-        found = yield from _look_at(frame, found, parts)
+    found, *seen = yield [(frame, 1.0), *(part.crop(frame) for part in parts or ())]
+    for part, people in zip(parts or (), seen, strict=True):
+        found = part.merge(found, people)
+    for step in STEPS if parts is None else ():
+        found = yield from _look_at(frame, found, find_small(found, frame.shape, step))
     found = yield from _look_at(frame, found, find_groups(found, frame.shape))
     return suppress(found, NMS_IOU)
 
@@ -154,7 +149,7 @@ def _find_all(frame: Frame, parts: Sequence[Part] | None) -> Steps:
 def _look_at(frame: Frame, found: People, parts: Sequence[Part]) -> Steps:
     """Return the people of earlier passes and of parts of the frame."""
     if parts:
-        seen = yield [partial(part.crop, frame) for part in parts]
+        seen = yield [part.crop(frame) for part in parts]
         for part, people in zip(parts, seen, strict=True):
             found = part.merge(found, people)
     return found

@@ -9,12 +9,13 @@ compute in 8-bit integers, from ONNX files that infra/embedded_detector/quantize
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
-from functools import reduce
 from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Final, NamedTuple, TypeVar
 
+import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
@@ -23,6 +24,7 @@ from torch.nn import functional
 
 from data_contracts.conventions import COCO17
 from worldpose.detection.crops import MAP_COUNT
+from worldpose.detection.sampling import borrow
 from worldpose.errors import InputError
 
 Net = TypeVar("Net", bound=nn.Module)
@@ -242,8 +244,8 @@ def decode_boxes(maps: Sequence[tuple[Tensor, ...]], least: float) -> Tensor:
             bottom [px].
         least: lowest score reported.
     """
-    chance = torch.sigmoid(torch.cat([logits.flatten() for logits, _ in maps]))
-    cell = torch.nonzero(chance >= least)[:, 0]
+    each_cell = torch.cat([logits.flatten() for logits, _ in maps])
+    cell = torch.nonzero(each_cell >= math.log(least / (1.0 - least)))[:, 0]
     sizes = [one.shape for logits, _ in maps for one in logits]
     rows, columns = torch.tensor(sizes, device=cell.device).unbind(dim=1)
     first = (rows * columns).cumsum(0) - rows * columns
@@ -254,9 +256,9 @@ def decode_boxes(maps: Sequence[tuple[Tensor, ...]], least: float) -> Tensor:
     step = torch.arange(-1, 2, device=cell.device)
     y = (row[:, None] + step).clamp(min=0).minimum(rows - 1) * columns + first[:, None]
     x = (column[:, None] + step).clamp(min=0).minimum(columns - 1)
-    near = chance.take(y[:, :, None] + x[:, None, :]).flatten(1)
+    near = each_cell.take(y[:, :, None] + x[:, None, :]).flatten(1)
     peak = near[:, 4] == near.amax(dim=1)
-    image, row, column, place, score = (
+    image, row, column, place, logit = (
         each[peak] for each in (image, row, column, place, near[:, 4])
     )
     ends = [0, *accumulate(len(logits) for logits, _ in maps)]
@@ -267,6 +269,8 @@ def decode_boxes(maps: Sequence[tuple[Tensor, ...]], least: float) -> Tensor:
     ]
     left, top, right, bottom = torch.cat(sides).unbind(dim=1)
     x, y = (STRIDE * at + 0.5 * (STRIDE - 1) for at in (column, row))
+    # PyTorch rounds the last numbers of an array otherwise, which double precision makes harmless.
+    score = torch.sigmoid(logit.double())
     return torch.stack([image, x - left, y - top, x + right, y + bottom, score], dim=1)
 
 
@@ -319,17 +323,20 @@ def decode_candidates(maps: Tensor, count: int) -> tuple[Tensor, Tensor]:
         (batch, joints, count); 0 where a map has fewer peaks with a probability of 0.01.
     """
     shape, (rows, columns) = maps.shape[:2], maps.shape[2:]
-    chance = functional.softmax(maps.flatten(2), dim=-1).view(-1, rows, columns)
+    flat = maps.flatten(2)
+    out = torch.from_numpy(borrow("chance", flat.shape, np.float32)) if maps.is_cpu else None
+    chance = torch.softmax(flat, dim=-1, out=out).view(-1, rows, columns)
     # Two peaks never share one of the blocks of 4 x 4 cells, and few of these are likely.
-    blocks = chance.view(-1, rows // 4, 4, columns)
-    high = _largest([blocks[:, :, k] for k in range(4)]).unflatten(2, (-1, 4))
-    high = _largest([high[..., k] for k in range(4)])
+    high = _larger_half(_larger_half(chance.view(-1, rows // 4, 4 * columns))).unflatten(2, (-1, 4))
+    high = torch.maximum(*torch.maximum(high[..., :2], high[..., 2:]).unbind(dim=-1))
     # Candidate positions of less probability are dropped, except the likeliest of a joint [1].
     min_mass = 0.01
     least = high.amax(dim=(1, 2), keepdim=True).clamp(max=min_mass / 25.0)
     index, row, column = torch.nonzero(high >= least, as_tuple=True)
     step = torch.arange(-3, 4, device=maps.device)
-    best = _around(chance, (index, 4 * row, 4 * column), step[3:]).flatten(1).max(dim=1)
+    first = (4 * index * high.shape[1] + 4 * row) * high.shape[2] + column
+    four = first[:, None] + high.shape[2] * step[3:]  # the block's rows of four cells
+    best = chance.view(-1, 4).index_select(0, four.flatten()).view(-1, 16).max(dim=1)
     row, column = 4 * row + best.indices // 4, 4 * column + best.indices % 4
     high = best.values
     for reach in (1, 3):  # most of these cells have a higher direct neighbour
@@ -349,9 +356,9 @@ def decode_candidates(maps: Tensor, count: int) -> tuple[Tensor, Tensor]:
     return places.view(*shape, count, 2), masses.view(*shape, count)
 
 
-def _largest(each: Sequence[Tensor]) -> Tensor:
-    """Return the elementwise maximum of tensors of one shape: faster than along an axis."""
-    return reduce(torch.maximum, each)
+def _larger_half(each: Tensor) -> Tensor:
+    """Return the elementwise maximum of both halves of rows (..., n): faster than along an axis."""
+    return torch.maximum(*each.chunk(2, dim=-1))
 
 
 def save_weights(path: Path, net: nn.Module, about: dict[str, str] | None = None) -> None:

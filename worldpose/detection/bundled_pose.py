@@ -21,11 +21,7 @@ from torch import Tensor
 from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.conventions import COCO17, COCO17_FLIP
 from data_contracts.keypoints import KeypointDetections
-from worldpose.detection.bundled_nets import (
-    KeypointNet,
-    Seen,
-    decode_candidates,
-)
+from worldpose.detection.bundled_nets import KeypointNet, Seen, decode_candidates
 from worldpose.detection.interfaces import People
 from worldpose.detection.net_inference import CROPS, PlacedNet, QuantizedNet, run_together
 from worldpose.detection.sampling import sample_crops

@@ -22,7 +22,7 @@ from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 
 if TYPE_CHECKING:
-    from worldpose.detection.sampling import Frame
+    from worldpose.detection.sampling import Frame, View
 
 STEPS: Final = ((36.0, 2.0), (18.0, 3.0))
 """Heights below which people are seen enlarged [px], and the enlargement [1]."""
@@ -57,12 +57,10 @@ class Part:
     heights: tuple[float, float]
     replaced: tuple[float, float] = (0.0, 0.0)
 
-    def crop(self, image: Frame) -> Frame:
-        """Return the resized crop of the frame."""
-        from worldpose.detection.sampling import resize  # late: planning does not need torch
-
+    def crop(self, image: Frame) -> View:
+        """Return the part of the frame, and its enlargement."""
         (left, top), (right, bottom) = self.corner, self.end
-        return resize(image[top:bottom, left:right], self.zoom)
+        return image[top:bottom, left:right], self.zoom
 
     def to_frame(self, people: People) -> People:
         """Return the part's people among those found in `crop`, in the frame's pixels."""
@@ -212,12 +210,13 @@ def find_groups(people: People, shape: tuple[int, ...]) -> list[Part]:
         people: detections in the whole frame.
         shape: height, width of the frame [px].
     """
-    from scipy.sparse.csgraph import connected_components  # late, as cv2
-
     sure = suppress(people, SAME_PERSON_IOU)
     boxes = sure.boxes[sure.scores >= MIN_GROUP_SCORE]
     # Neighbours in a group overlap more [1, intersection over union].
-    _, member = connected_components(box_iou(boxes, boxes) > 0.15, directed=False)
+    near = (box_iou(boxes, boxes) > 0.15) | np.eye(len(boxes), dtype=np.bool_)
+    member, before = np.arange(len(boxes)), np.empty(0, dtype=np.int64)
+    while len(boxes) and not np.array_equal(member, before):  # each takes the first number around
+        before, member = member, np.where(near, member, len(near)).min(axis=1)
     counts = np.bincount(member)
     boxes = boxes[np.lexsort((boxes[:, 3] - boxes[:, 1], member))]
     grouped = np.repeat(counts > 1, counts)

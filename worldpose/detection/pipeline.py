@@ -24,12 +24,7 @@ from worldpose.detection.interfaces import (
     PoseEstimator,
     ScoreMap,
 )
-from worldpose.detection.models import (
-    load_detectors,
-    load_landmarks,
-    load_pose,
-    load_score_map,
-)
+from worldpose.detection.models import load_detectors, load_landmarks, load_pose, load_score_map
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import combine_boxes, fuse, suppress, suppress_poses
 from worldpose.detection.turning import QuarterTurn
@@ -385,14 +380,14 @@ class PeopleFinder:
                 chosen = replace(chosen, score=self._score_map.probability(chosen.score))
             self.report.empty += not len(best)
             kept.append(chosen)
+        nobody = KeypointDetections.empty()
         if self._landmarks is not None:
             kept = self._landmarks.add_points(images, kept)
-        rows, nobody = iter(kept), KeypointDetections.empty()
-        if self._landmarks is not None:
             points = self._landmarks.points
             nobody = nobody.add_points(
                 points, np.empty((0, len(points), 2)), np.empty((0, len(points)))
             )
+        rows = iter(kept)
         return [nobody if image is None else next(rows) for image, _ in batch]
 
     def _chunk(self, numbers: list[int], rows: list[KeypointDetections]) -> KeypointDetections:

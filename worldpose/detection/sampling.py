@@ -6,15 +6,17 @@ frames of a batch at once.
 
 from __future__ import annotations
 
+import math
 import threading
 import weakref
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
 import torch
+from numpy.typing import DTypeLike, NDArray
 from torch import Tensor
 from torch.nn import functional
 
@@ -30,6 +32,8 @@ from worldpose.detection.crops import (
 
 Frame = Image | Tensor
 """A frame (height, width, 3) of bytes: an array on a CPU, a tensor on a GPU."""
+View = tuple[Frame, float]
+"""A frame or a part of it, and the factor by which it is enlarged or reduced [1]."""
 _COPIES: Final[dict[int, tuple[weakref.ref[Image], Tensor]]] = {}
 """Copies on the GPU by the identity of the frame, for as long as it lives."""
 _THREAD: Final = threading.local()
@@ -53,45 +57,62 @@ def _copy(image: Image, device: str) -> Tensor:
     return known[1]
 
 
-def resize(image: Frame, zoom: float) -> Frame:
-    """Return a frame enlarged or reduced by a factor."""
-    height, width = image.shape[:2]
-    size = (max(1, round(zoom * width)), max(1, round(zoom * height)))
+def borrow(name: str, shape: Sequence[int], dtype: DTypeLike = np.uint8) -> NDArray[Any]:
+    """Return an array of the thread, which the thread's next call with this name overwrites.
+
+    Large arrays that come and go cost more for their pages than for what is written to them.
+    """
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    known = vars(_THREAD).get(name)
+    if known is None or len(known) < size:
+        known = vars(_THREAD)[name] = np.empty(size, dtype=np.uint8)
+    return np.asarray(known[:size].view(dtype).reshape(shape))
+
+
+def resized_shape(view: View) -> tuple[int, int]:
+    """Return the height, width of a view [px]."""
+    image, zoom = view
+    return max(1, round(zoom * image.shape[0])), max(1, round(zoom * image.shape[1]))
+
+
+def resize(view: View, into: Image | None = None) -> Frame:
+    """Return the view of a frame; on a CPU it may be written `into` an array."""
+    (image, zoom), shape = view, resized_shape(view)
+    if shape == tuple(image.shape[:2]):
+        return image
     if isinstance(image, Tensor):
         planes = image.permute(2, 0, 1)[None].float()
         way = "bilinear" if zoom >= 1.0 else "area"
-        resized = functional.interpolate(planes, size[::-1], mode=way)[0]
+        resized = functional.interpolate(planes, shape, mode=way)[0]
         return resized.permute(1, 2, 0).round_().to(torch.uint8)
     method = cv2.INTER_LINEAR if zoom >= 1.0 else cv2.INTER_AREA
-    return np.asarray(cv2.resize(image, size, interpolation=method), dtype=np.uint8)
+    return np.asarray(cv2.resize(image, shape[::-1], into, interpolation=method), dtype=np.uint8)
 
 
-def pad(images: Sequence[Frame], shape: Sequence[int]) -> Tensor:
-    """Return the planes of images (n, 3, height, width), grey to the right of and below each.
+def pad(views: Sequence[View], shape: Sequence[int]) -> Tensor:
+    """Return the planes of views (n, 3, height, width), grey to the right of and below each.
 
     On a CPU the thread's next call overwrites them.
 
     Args:
-        images: smaller ones of any size.
+        views: smaller ones of any size.
         shape: height, width [px].
     """
-    whole = (len(images), 3, *shape)
-    if isinstance(images[0], Tensor):
-        padded = images[0].new_full(whole, OUTSIDE)
-        for canvas, image in zip(padded, images, strict=True):
-            canvas[:, : image.shape[0], : image.shape[1]] = torch.as_tensor(image).permute(2, 0, 1)
+    whole = (len(views), 3, *shape)
+    if isinstance(first := views[0][0], Tensor):
+        padded = first.new_full(whole, OUTSIDE)
+        for canvas, view in zip(padded, views, strict=True):
+            seen = torch.as_tensor(resize(view))
+            canvas[:, : seen.shape[0], : seen.shape[1]] = seen.permute(2, 0, 1)
         return padded
-    size = int(np.prod(whole))
-    # Large arrays that come and go cost more for their pages than for what is written to them.
-    if getattr(_THREAD, "size", 0) < size:
-        _THREAD.size, _THREAD.planes = size, np.empty(size, dtype=np.uint8)
-    scratch = _THREAD.planes[:size].reshape(whole)
-    for planes, image in zip(scratch, images, strict=True):
-        height, width = image.shape[:2]
+    batch = borrow("planes", whole)
+    for planes, view in zip(batch, views, strict=True):
+        height, width = resized_shape(view)
         planes[:, height:], planes[:, :height, width:] = OUTSIDE, OUTSIDE
+        image = np.asarray(resize(view, borrow("view", (height, width, 3))))
         # Far faster than a transposition.
-        cv2.split(np.asarray(image), list(planes[:, :height, :width]))
-    return torch.from_numpy(scratch)
+        cv2.split(image, list(planes[:, :height, :width]))
+    return torch.from_numpy(batch)
 
 
 def sample_crops(
@@ -110,7 +131,8 @@ def sample_crops(
 
     Returns:
         Maps from pixels of the crops to those of the frames (crops, 2, 3), planes (crops, 3,
-        height, width) of bytes, and maps (crops, 3, rows, columns).
+        height, width) of bytes, which the thread's next call overwrites on a CPU, and maps (crops,
+        3, rows, columns).
     """
     flat = np.concatenate(boxes)
     mappings = frame_from_crop(crops_around(flat), CROP)
@@ -120,7 +142,7 @@ def sample_crops(
         each = [_sample(f, mappings[a:b]) for f, (a, b) in zip(frames, pairwise(ends), strict=True)]
         crops = torch.cat(each)
     else:
-        crops = torch.empty((len(flat), 3, CROP[1], CROP[0]), dtype=torch.uint8)
+        crops = torch.from_numpy(borrow("crops", (len(flat), 3, CROP[1], CROP[0])))
         of = np.repeat(np.arange(len(boxes)), np.diff(ends))
         for planes, at, mapping in zip(crops.numpy(), of, mappings, strict=True):
             cv2.split(cut_crop(images[int(at)], mapping, CROP), list(planes))

@@ -137,7 +137,10 @@ def align_positions(
 
     tried = {step: try_step(step) for step in steps}
     # The rate of the times, or the match's own, holds unless another agrees clearly better.
-    step = min(tried, key=lambda step: tried[step][0][0] * (0.5 if step == likely else 1.0))
+    step = min(
+        tried,
+        key=lambda step: (tried[step][0][0] * (0.5 if step == likely else 1.0), step != likely),
+    )
     (best, way, turned, apart), (second, *_) = tried[step]
     if not best < min(most, 0.5 * second):
         raise InputError(
@@ -155,6 +158,11 @@ def align_positions(
     )
     said = (f"{person}: {names[n]}" for p, (person, n) in enumerate(pairs) if off[n, p] < most)
     notes = [f"people: {{{', '.join(said)}}}"]
+    alike = 0.05  # distances of two rates that tell nothing [m]
+    likewise = [each for each in tried if tried[each][0][0] <= max(2.0 * best, alike)]
+    if not np.isfinite(rate) and len(likewise) > 1:
+        told = "warning: the positions have no times, and people move too little to tell their rate"
+        notes.insert(0, f"{told}; one frame of theirs is taken as {step:g} of the match")
     if step != 1.0:
         how = "by its times" if fps and np.isfinite(rate) else "by agreement alone"
         notes.insert(0, f"each frame of the positions is {step:g} frames of the match, {how}")

@@ -32,7 +32,6 @@ from worldpose.formats.files import read_toml
 NUMBER_LIMIT: Final = 1e9
 """Maximum absolute value of any entry, whatever its unit."""
 
-
 ROTATION_TOLERANCE: Final = 1e-4
 """Maximum rounding error of R R^T = I [1]; four decimals give less."""
 
@@ -190,10 +189,13 @@ def index_by_name(
 
 
 def require_poses(path: Path, cameras: Mapping[str, CameraCalibration]) -> None:
-    """Raise InputError if several cameras are all in one place."""
+    """Raise InputError if several cameras are all in one place, or the only one has no pose."""
     centers = np.array([-np.array(each.rotation).T @ each.translation for each in cameras.values()])
-    if len(cameras) > 1 and np.ptp(centers, axis=0).max() <= 1e-6 * np.abs(centers).max():
-        found = "all cameras in one place: a calibration before the poses were found"
+    is_lens = all(np.array_equal(each.rotation, np.eye(3)) for each in cameras.values())
+    at_one = np.ptp(centers, axis=0).max() <= 1e-6 * np.abs(centers).max()
+    if at_one and (len(cameras) > 1 or (is_lens and not centers.any())):
+        found = "all cameras in one place" if len(cameras) > 1 else "one camera, at the origin"
+        found += ": a calibration before the poses were found"
         todo = (
             "Import its lenses with worldpose import --lens FILE --out MATCH, and locate the "
             "cameras by clicks or by worldpose locate-cameras."
@@ -314,9 +316,9 @@ def read_optics(where: str, table: Mapping[str, Any], keys: Keys = Keys()) -> Op
     """
     matrix = _read_numbers(table, where, keys.matrix, (3, 3))
     size = _read_numbers(table, where, keys.size, (2,))
-    fisheye = is_fisheye(where, table)
     numbers = np.ravel(_read_numbers(table, where, keys.distortions, None))
-    distortion, model = _read_lens(f"{where}.{keys.distortions}", numbers, fisheye=fisheye)
+    said = read_model(where, table)
+    distortion, model = _read_lens(f"{where}.{keys.distortions}", numbers, *said)
     off_diagonal = [matrix[0, 1], matrix[1, 0], *matrix[2, :2], matrix[2, 2] - 1]
     if np.any(np.abs(off_diagonal) > 1e-9):
         raise calibration_error(
@@ -348,8 +350,8 @@ def plain_key(key: str) -> str:
     return key if len(key) == 1 else key.replace("_", "").lower()
 
 
-def is_fisheye(where: str, given: Mapping[str, Any]) -> bool:
-    """Return whether the entries of a lens say, under any usual name, that it is a fisheye.
+def read_model(where: str, given: Mapping[str, Any]) -> tuple[bool, bool]:
+    """Return whether a lens's entries say, under any usual name, that it is a fisheye, or is none.
 
     Raises:
         InputError: one names another lens model than those of OpenCV, or two contradict.
@@ -375,15 +377,17 @@ def is_fisheye(where: str, given: Mapping[str, Any]) -> bool:
     if yes and no:
         found = ", ".join(f"{key} {word}" for word, key in said.items())
         raise calibration_error(where, "one lens model", found)
-    return bool(yes)
+    return bool(yes), bool(no - {"0", "0.0", "false"})
 
 
 def _read_lens(
-    where: str, numbers: NDArray[np.float64], *, fisheye: bool
+    where: str, numbers: NDArray[np.float64], fisheye: bool, is_named: bool
 ) -> tuple[NDArray[np.float64], LensName]:
     """Return coefficients in OpenCV's order, and their model; OpenCV writes up to 14 numbers."""
     # Maximum p1 and p2 [1]; real lenses have 0.005, webcams up to 0.02. Four numbers name no k3.
-    max_tangential = 0.01 if len(numbers) == 4 else 0.025
+    # Poor calibrations reach 0.07: their k3 is larger than what another order has in its place.
+    k3, p = (np.abs(each).max(initial=0.0) for each in (numbers[4:5], numbers[2:4]))
+    max_tangential = 0.1 if is_named or k3 > p else 0.01 if len(numbers) == 4 else 0.025
     is_rational = not fisheye and bool(np.any(numbers[5:8] != 0))
     model: LensName = "fisheye" if fisheye else "rational" if is_rational else "brown"
     names = COEFFICIENTS[model]
@@ -393,11 +397,12 @@ def _read_lens(
             "k1 k2 k3 k4 of a fisheye" if fisheye else "k1 k2 p1 p2, with k3, or with k3 k4 k5 k6",
             f"{len(numbers)} numbers{', a lens model with more terms' * (len(numbers) > 5)}",
         )
-    if not fisheye and np.abs(numbers[2:4]).max() > max_tangential:
+    if not fisheye and p > max_tangential:
         expected = f"k1 k2 p1 p2 k3 with p1 and p2 up to {max_tangential:g}"
         todo = (
             "If this is k1 k2 k3 k4 of a fisheye, say so in the file: fisheye = true in TOML, "
-            "fisheye_model: 1 in others. If it is k1 k2 k3 p1 p2, move k3 to the end."
+            "fisheye_model: 1 in others. If it is k1 k2 k3 p1 p2, move k3 to the end. If it is "
+            "right, name its model: distortion_model = plumb_bob."
         )
         raise InputError(where, expected, str(numbers.tolist()), todo)
     return np.append(numbers, 0.0)[: len(names)], model

@@ -37,7 +37,7 @@ from worldpose.formats.calibration_programs import (
 from worldpose.formats.calibration_systems import read_calibration_xml
 from worldpose.formats.calibration_unit import (
     MILLIMETRE,
-    other_middle,
+    doubt_middle,
     require_metres,
     require_middle,
     toml_unit_m,
@@ -115,12 +115,8 @@ def read_calibration(
     if not any_unit:
         require_metres(path, cameras, form_unit_m(path))
     if left_out is not None:
-        left_out.notes += [
-            f"warning: the principal point of {name} is {found}; is its size of "
-            "{} x {} px right?".format(*camera.image_size)
-            for name, camera in cameras.items()
-            if (found := other_middle(camera.principal_point_px, camera.image_size))
-        ]
+        for name, camera in cameras.items():
+            left_out.notes += doubt_middle(name, camera.principal_point_px, camera.image_size)
     return cameras
 
 

@@ -63,6 +63,13 @@ def other_middle(principal_point: Sequence[float], size: Sequence[int]) -> str:
     return f"{x}, {y}, the middle of about {size_of[0]:.0f} x {size_of[1]:.0f} px"
 
 
+def doubt_middle(name: str, principal_point: Sequence[float], size: Sequence[int]) -> list[str]:
+    """Return a warning about a stated image size whose middle is not near the principal point."""
+    found = other_middle(principal_point, size)
+    doubt = f"is its size of {size[0]} x {size[1]} px right?"
+    return [f"warning: the principal point of {name} is {found}; {doubt}"] if found else []
+
+
 def require_middle(
     where: str, principal_point: Sequence[float], size: tuple[int, int], todo: str
 ) -> None:

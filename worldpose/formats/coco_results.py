@@ -13,6 +13,7 @@ The frame is a whole `image_id`, or the number in an `image_id` that is a file's
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain, takewhile
 from pathlib import Path
@@ -274,11 +275,14 @@ def _categories(path: Path, limit: int) -> _Categories:
     lists = [each.get("keypoints") for each in given]
     names = [tuple(map(str, each)) if isinstance(each, list) else () for each in lists]
     of: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+    balls: list[dict[str, Any]] = []
     for own, each in zip(names, given, strict=True):
-        of.setdefault(own, []).append(each)
+        is_ball = "ball" in re.split(r"[^a-z]+", str(each.get("name")).lower())
+        (balls if is_ball else of.setdefault(own, [])).append(each)
+    ids = [each.get("id", ()) for each in balls]
     nameless = of.pop((), [])
     if not of:
-        return _Categories()
+        return _Categories(called="people", others=ids)
     chosen = [key for key in of if any(each.get("name") == "person" for each in of[key])]
     chosen = list(of) if len(of) == 1 else chosen
     if len(chosen) != 1:
@@ -286,7 +290,7 @@ def _categories(path: Path, limit: int) -> _Categories:
         raise _wrong(f"{path}: categories", "the keypoints of one category", f"{count}")
     people = of.pop(chosen[0])
     called = ", ".join(str(each.get("name", each.get("id"))) for each in people)
-    others = [each.get("id", ()) for each in chain.from_iterable(of.values())]
+    others = [*ids, *(each.get("id", ()) for each in chain.from_iterable(of.values()))]
     return _Categories(chosen[0], called, others, [each.get("id", ()) for each in nameless])
 
 

@@ -191,7 +191,13 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
     # Right and bottom are larger than left and top in every box, end in the image, and end beyond
     # it as sides of boxes.
     cut = ((boxes[:, 2:] - size > 0.1 * box[:, 2:]).any(axis=1)) & is_person
-    is_corner = (box[is_person, 2:] > box[is_person, :2]).all() and cut.sum() > 0.2 * len(cut)
+    is_corner = (box[is_person, 2:] > box[is_person, :2]).all()
+    # So does the right side follow the left one, as no width does, where people move about.
+    left, right = box[is_person][:, [0, 2]].T
+    enough = 10  # boxes
+    with np.errstate(invalid="ignore"):
+        follows = len(left) >= enough and np.std(right - left) < 0.3 * np.std(right)
+    is_corner &= follows or cut.sum() > 0.2 * len(cut)
     within = (box[:, 2:] <= np.array(size) + 1.0).all(axis=1) & is_person
     is_corner &= within.sum() > 0.9 * is_person.sum()
     outside = ((boxes[:, :2] >= np.array(size) - 0.5) | (boxes[:, 2:] <= -0.5)).any(axis=1)
@@ -204,12 +210,17 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
         (again & kept & (person >= 0), "id", "each id once in a frame"),
         ((box[:, 2:] <= 0.0).any(axis=1), "width, height", "more than 0 px"),
         (
+            (box[:, 3] <= 1.0) & ((box[:, 3] <= 1.0).mean() > 0.5),
+            "height",
+            "more than 1 px, as most should be; is the id missing, and this the confidence?",
+        ),
+        (
             outside & (outside.mean() > 0.5),
             "left, top, width, height",
             f"a box in the image of {size[0]} x {size[1]} px, as most should be",
         ),
         (
-            cut & is_corner,
+            is_person & is_corner & (cut | follows),
             "left, top, width, height",
             f"width and height of a box in the image of {size[0]} x {size[1]} px, as most should "
             "be; are these right and bottom?",

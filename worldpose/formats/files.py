@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import codecs
 import errno
+import hashlib
 import json
 import os
 import re
@@ -39,6 +40,28 @@ def by_last_number(named: Mapping[str, Any]) -> dict[str, Any]:
     numbers = {name: re.findall(r"\d+", name) for name in named}
     key = (lambda name: int(numbers[name][-1])) if all(numbers.values()) else lambda _: 0
     return {name: named[name] for name in sorted(named, key=key)}
+
+
+_READ = [0]
+
+
+def bytes_read() -> int:
+    """Return a number that grows while any thread of this process is in `sha256_of_file`."""
+    return _READ[0]
+
+
+def sha256_of_file(path: Path) -> str:
+    """Return the SHA-256 of a file; `bytes_read` tells its progress, as of a slow disk.
+
+    Raises:
+        OSError: the file is unreadable.
+    """
+    sha256 = hashlib.sha256()
+    with path.open("rb", buffering=0) as file:
+        while piece := file.read(CHUNK):
+            sha256.update(piece)
+            _READ[0] += len(piece)
+    return sha256.hexdigest()
 
 
 @contextmanager
@@ -200,6 +223,10 @@ class _Loader(yaml.SafeLoader):
 
 
 def _load_yaml(text: str) -> Any:  # noqa: ANN401
+    # The head of OpenCV's files, also of camchains, is none of YAML's. YAML allows tabs before a
+    # comment and at the end of a line; the parser does not.
+    text = re.sub(r"\A%YAML:.*", "", text)
+    text = re.sub(r"\t[ \t]*(?=#|$)", " ", text, flags=re.MULTILINE)
     # Events arrive one by one, so that the check rejects a bomb before construction.
     depth = 0
     for count, event in enumerate(yaml.parse(text, Loader=yaml.SafeLoader)):

@@ -81,11 +81,15 @@ def known_frames(camera: Camera) -> tuple[NDArray[np.int64], Camera]:
     return rows, camera[rows]
 
 
-def lens_notes(camera: Camera) -> dict[str, Any]:
-    """Return a single camera's lens model, and its coefficients under a key that names them."""
-    model = LensModel(int(camera.lens_model)).label
-    names = "_".join(COEFFICIENTS[model])
-    return {"lens_model": model, f"distortion_{names}": camera.coefficients.tolist()}
+def lens_notes(known: Camera) -> tuple[str, str, Floats]:
+    """Return lens model, key that names its coefficients, and these (frames, n) of a camera.
+
+    There is one row if the lens is the same in all frames (frames,) of the camera.
+    """
+    model = LensModel(int(known[0].lens_model))
+    key, values = "_".join(["distortion", *COEFFICIENTS[model.label]]), known.distortion
+    values = values[:, model.columns]
+    return model.label, key, values[:1] if (values == values[0]).all() else values
 
 
 @dataclass
@@ -162,8 +166,8 @@ def write_gltf(
     surface has the person's shape and the model's skinning weights, without pose correctives.
 
     Cameras have the focal length and pose, and their `extras` the rest: image size, principal
-    point and distortion, and of a moving camera the focal length of every frame, since glTF
-    cannot animate it.
+    point and distortion, and of a moving camera the focal length of every frame, and the
+    distortion where it changes, since glTF cannot animate them.
 
     Args:
         path: the file.
@@ -346,11 +350,17 @@ class _Writer:
             Rotation.from_matrix(known.cam_from_world.rotation.swapaxes(-1, -2) @ FACING).as_quat()
         ).astype(np.float32)
         centers = known.center.astype(np.float32)
+        model, key, lenses = lens_notes(known)
         about: dict[str, Any] = {
             "image_size_px": [int(width), int(height)],
             "principal_point_px": known.principal_point[0].tolist(),
-            **lens_notes(known[0]),
+            "lens_model": model,
         }
+        if len(lenses) == 1:
+            about[key] = lenses[0].tolist()
+        else:
+            of_row = dict(zip(rows.tolist(), lenses.tolist(), strict=True))
+            about[f"{key}_by_frame"] = [of_row.get(row) for row in range(len(camera.focal))]
         if camera.batch_shape not in ((), (1,)):
             about["focal_px_by_frame"] = [
                 None if np.isnan(one) else round(one, 3) for one in camera.focal[:, 1].tolist()

@@ -235,11 +235,12 @@ def order_by_points(where: str, points: AnyFloats, stated: str | None = None) ->
     misfits = [_misfit(order.select(points), pairs, _LENGTHS) for order in orders]
     chosen = orders[0]
     for order, misfit in zip(orders, misfits, strict=True):
-        if misfit <= plausible and misfits[0] - misfit >= _MARGIN:
+        # An order that lacks the limbs, of NaN, explains nothing.
+        if misfit <= wrong and not misfits[0] - misfit < _MARGIN:
             chosen = order
     if size == len(COCO17):
         other = _misfit(points, np.reshape(_HUMAN36M, (5, 2, 2)), _HUMAN36M_LENGTHS)
-        if other <= plausible and misfits[0] - other >= _MARGIN:
+        if other <= plausible and not misfits[0] - other < _MARGIN:
             found = "thighs, shanks and arms as in the order of Human3.6M"
             todo = "Estimate poses with a model of COCO, or write COCO's joints."
             raise InputError(where, "the 17 joints in COCO's order", found, todo)

@@ -25,7 +25,6 @@ from worldpose.formats.calibration_files import (
     MODEL_NAMES,
     calibration_error,
     camera_tables,
-    is_fisheye,
     plain_key,
     read_optics,
     require_optics,
@@ -50,7 +49,7 @@ DISTORTION_NAMES: Final = (
     *("distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoefs", "distcoeff"),
     *("distcoef", "dist", "cameradist", "distortions", "distortion", "D", "d"),
 )
-_OWNERS: Final = ("image", "img", "frame", "video", "picture", "calibration")
+_OWNERS: Final = ("image", "img", "frame", "video", "picture", "calibration", "camera", "cam")
 SIZE_NAMES: Final = (
     *((f"{owner}width", f"{owner}height") for owner in ("", *_OWNERS)),
     *(("size",), ("resolution",), ("dim",)),
@@ -111,13 +110,9 @@ def read_lenses(
         "size": list(own or sizes[camera]),
         "matrix": (matrix.reshape(3, 3) if matrix.shape == (9,) else matrix).tolist(),
         "distortions": distortion.tolist(),
-        "fisheye": is_fisheye(where, given),
+        **{key: value for key, value in given.items() if plain_key(key) in MODEL_NAMES},
     }
-    lens = _lens(where, camera, table, sizes[camera])
-    if own is None:
-        todo = "Add the calibrated images' size to the file: image_size = [WIDTH, HEIGHT]."
-        require_middle(where, lens.principal_point_px, sizes[camera], todo)
-    return {camera: lens}
+    return {camera: _lens(where, camera, table, sizes[camera], has_size=own is not None)}
 
 
 def read_lens_toml(
@@ -292,12 +287,11 @@ def kalibr_tables(
         expected = "a camchain of Kalibr, or EasyMocap's intri.yml and extri.yml"
         raise calibration_error(str(path), expected, f"{content!r:.60}")
     pose: NDArray[np.float64] | None = np.eye(4)
-    tables = {str(name): given for name, given in content.items()}
+    tables = {str(name): given for name, given in content.items() if isinstance(given, dict)}
     if all(re.fullmatch(r"cam\d+", name) for name in tables):
         tables = by_last_number(tables)  # Kalibr writes cam0, cam1, cam10, cam2
     for index, (name, given) in enumerate(tables.items()):
         where = f"{path}: {name}"
-        given = given if isinstance(given, dict) else {}
         model, lens = given.get("camera_model"), given.get("distortion_model", "none")
         if model != "pinhole" or lens not in ("radtan", "equidistant", "none"):
             expected = "camera_model pinhole with distortion_model radtan, equidistant or none"
@@ -336,9 +330,9 @@ def _chain(
         matrix = np.array(step, np.float64)
     except (TypeError, ValueError):
         matrix = np.empty(0)
-    if matrix.shape != (4, 4):
+    if matrix.shape not in ((4, 4), (16,)):
         raise calibration_error(where, "numbers of shape (4, 4)", f"{step!r:.60}")
-    return matrix @ pose
+    return matrix.reshape(4, 4) @ pose
 
 
 def _read_mapping(file: Path) -> dict[str, Any]:
@@ -414,7 +408,12 @@ def _image_size(given: Mapping[str, Any]) -> tuple[int, int] | None:
 
 
 def _lens(
-    where: str, name: str, table: Mapping[str, Any], size: tuple[int, int]
+    where: str,
+    name: str,
+    table: Mapping[str, Any],
+    size: tuple[int, int],
+    *,
+    has_size: bool = True,
 ) -> LensCalibration:
     """Return the lens of a table at the size of the camera's images."""
     # The same of the image corner's displacement, relative to its distance from the centre
@@ -453,6 +452,9 @@ def _lens(
         raise calibration_error(
             f"{where}.{entry}", str(first["msg"]), str(first["input"])
         ) from error
+    if not has_size:
+        todo = "Add the calibrated images' size to the file: image_size = [WIDTH, HEIGHT]."
+        require_middle(where, lens.principal_point_px, size, todo)
     from worldpose.geometry.cameras import Camera  # late: it loads the kernels
 
     Camera.from_lens(lens).require_rays(where)

@@ -25,8 +25,7 @@ _TOKEN: Final = re.compile(r'"[^"]*"|[^\s"]+')
 
 def is_storage(file: Path) -> bool:
     """Return whether a YAML or JSON file is one of OpenCV's FileStorage."""
-    text = read_text(file, SETTINGS_BYTES)
-    return "%YAML:" in text[:64] or "opencv-matrix" in text
+    return "opencv-matrix" in read_text(file, SETTINGS_BYTES)
 
 
 def read_file_storage(file: Path) -> dict[str, Any]:
@@ -51,9 +50,7 @@ def read_file_storage(file: Path) -> dict[str, Any]:
         text = re.sub(r"(?<=\d\.)(?=[\s,\]}])", "0", text)  # OpenCV writes 1. and .Nan
         content = parse_json(where, re.sub(r"\.(Nan|Inf)\b", lambda it: words[it[1]], text))
     else:
-        head, _, rest = text.partition("\n")
-        plain = rest if head.startswith("%YAML") else text
-        content = parse_yaml(where, plain.replace("!!opencv-", "!!map #"))
+        content = parse_yaml(where, text.replace("!!opencv-", "!!map #"))
     if not isinstance(content, dict):
         raise calibration_error(where, expected, type(content).__name__)
     found = {str(name): _read_value(f"{where}: {name}", each) for name, each in content.items()}
@@ -113,7 +110,7 @@ def _read_matrix(where: str, table: dict[str, Any]) -> NDArray[np.float64]:
     # Length of the text before base64 data, which repeats the type [byte].
     header_bytes = 24
     try:
-        kind = re.fullmatch(r"(\d{0,3})([ucwsifd])", str(table["dt"]))
+        kind = re.fullmatch(r"(\d{0,3})([ucwsifd])", str(table.get("dt", "d")))  # ROS has none
         if kind is None:
             raise ValueError(f"the type {table['dt']!r:.20}")
         sizes = table["sizes"] if "sizes" in table else [table["rows"], table["cols"]]

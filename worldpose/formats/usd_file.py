@@ -43,7 +43,8 @@ def write_usd(
     The stage is in metres, z up, as the world is; a time code is a frame. Each person is a SkelRoot
     with a skeleton of 24 joints, its animation, and a mesh with the person's shape and the model's
     skinning weights, without pose correctives. A missing person is invisible. Cameras have
-    focal length, principal point and pose, and their distortion as custom data.
+    focal length, principal point and pose, and their distortion as custom data, or as an attribute
+    of the same name with time samples where it changes.
 
     Args:
         path: the file.
@@ -206,17 +207,21 @@ class _Writer:
         prim.CreateHorizontalApertureOffsetAttr(-float(center[0]))
         prim.CreateVerticalApertureOffsetAttr(float(center[1]) * tall)
         prim.CreateClippingRangeAttr(self.Gf.Vec2f(0.1, 1000.0))
+        model, key, lenses = lens_notes(known)
         prim.GetPrim().SetCustomData(
             {
                 "camera": name,
                 "image_size_px": self.Gf.Vec2i(int(width), int(height)),
                 "principal_point_px": self.Gf.Vec2d(*known.principal_point[0].tolist()),
-                **{
-                    key: value if isinstance(value, str) else self.Vt.DoubleArray(value)
-                    for key, value in lens_notes(known[0]).items()
-                },
+                "lens_model": model,
+                **({key: self.Vt.DoubleArray(lenses[0].tolist())} if len(lenses) == 1 else {}),
             }
         )
+        if len(lenses) > 1:
+            kind = self.Sdf.ValueTypeNames.DoubleArray
+            changing = prim.GetPrim().CreateAttribute(key, kind)
+            for frame, lens in zip(rows.tolist(), lenses.tolist(), strict=True):
+                changing.Set(self.Vt.DoubleArray(lens), frame)
         placed = self.UsdGeom.Xformable(prim).AddTransformOp()
         focal = prim.CreateFocalLengthAttr()
         turns = known.cam_from_world.rotation.swapaxes(-1, -2) @ FACING

@@ -12,6 +12,7 @@ from typing import Final
 
 from data_contracts.match import Registration, SourceFile
 from worldpose.errors import InputError, say_failure
+from worldpose.formats.files import sha256_of_file
 from worldpose.ingest.match_folder import LENS_FILE, MatchFolder
 from worldpose.ingest.pitch_file import pitch_file
 from worldpose.ingest.validation import reachable
@@ -78,8 +79,7 @@ def digest_of_files(path: Path) -> str:
         OSError: a file is unreadable.
     """
     if not path.is_dir():
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        return sha256_of_file(path)
     listed = hashlib.sha256()
     for name in sorted(_files_under(path, path)):
         listed.update(f"{digest_of_files(path / name)} {name}\n".encode())
@@ -124,8 +124,7 @@ def _source_file(folder: Path, path: str, known: dict[tuple[str, int, int], str]
             raise InputError(str(folder / path), "a file with content", "0 bytes", todo)
         sha256 = known.get((path, before.st_size, before.st_mtime_ns))
         if sha256 is None:
-            with (folder / path).open("rb") as file:
-                sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+            sha256 = sha256_of_file(folder / path)
     except OSError as error:
         todo = "Check its rights, or wait until it is written."
         raise InputError(str(folder / path), "a readable file", say_failure(error), todo) from error

@@ -193,8 +193,12 @@ def check_agreement(
     evidence, wrong = problem.evidence, _outlier_share(fit)
     factor = found.noise_factor(stated)
     if is_suspicious(fit, factor):
-        size = _find_size(scale_noise(problem, 1.0 / factor, settings)[0], pitch, stated)
-        if size is not None:
+        exact = scale_noise(problem, 1.0 / factor, settings)[0]
+        size = _find_size(exact, pitch, stated)
+        # Without outliers, clicks that are less exact than stated fit another size by chance.
+        if size is not None and (
+            wrong > 0.2 or _fits_better(_start_on_pitch(exact, pitch, size, stated), found, stated)
+        ):
             raise _size_error(problem, pitch, size)
     if wrong > settings.max_wrong_share:
         kept = [n for n, inlier in zip(evidence.points, fit.inliers, strict=True) if inlier]
@@ -231,22 +235,32 @@ def check_unit(
     With lens distortion and one or two outliers, the clicks also fit a pitch that is 9 % too large.
     """
     size = _size_in_yards(pitch)
-    other = _start_on_pitch(problem, pitch, size, settings)
     # A score of points alone decides nothing where drawn markings also constrain the camera.
-    if other is None or problem.evidence.markings:
+    if problem.evidence.markings:
         return
-    points, row = other
+    if _fits_better(_start_on_pitch(problem, pitch, size, settings), best, settings):
+        raise _size_error(problem, pitch, size)
+
+
+def _fits_better(
+    start: tuple[CameraProblem, Floats] | None,
+    best: Explanation,
+    settings: StaticCalibrationSettings,
+) -> bool:
+    """Return whether a fit from a start on another pitch is far more probable than the best one."""
+    if start is None:
+        return False
+    points, row = start
     try:
         found = fit_inliers_at_best_noise(points, row, settings)
     except InputError:
-        return
-    in_yards, given = (
+        return False
+    other, given = (
         negative_log_posterior(each, factor=each.noise_factor(settings), with_prior=True)
         for each in (found, best)
     )
     # Twice the logarithm of a probability ratio of a thousand, since the fault is rare.
-    if in_yards < given - 14.0 and _outlier_share(found.fit) <= _MAX_OUTLIER_SHARE:
-        raise _size_error(problem, pitch, size)
+    return other < given - 14.0 and _outlier_share(found.fit) <= _MAX_OUTLIER_SHARE
 
 
 def _size_error(problem: CameraProblem, pitch: PitchTemplate, size: _PitchSize) -> InputError:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from itertools import islice
 
 from data_contracts.run import Reservation, RunRecord
 from worldpose.errors import CorruptionError, InputError, StoreError
@@ -59,7 +60,8 @@ def plan_gc(
 
     Args:
         store: the project.
-        keep_last: keep only this many of each match's newest run records; None keeps all.
+        keep_last: keep only this many of each match's newest run records, and the newest complete
+            one; None keeps all.
         forget: runs to drop, as `match/0003`; an unfinished one counts as dead, and a pinned one
             must be unpinned first.
         older_than: the age below which results and leftovers are kept.
@@ -184,12 +186,12 @@ def _select_runs(
 ) -> tuple[list[str], list[str]]:
     """Return the ids of the finished runs to drop, and of those to keep."""
     finished, pinned = store.runs(match_id), _pin_names(store, match_id)
-    newest = finished if keep_last is None else finished[-keep_last:]
-    kept = [
-        run_id
-        for run_id in finished
-        if run_id in pinned or (run_id in newest and f"{match_id}/{run_id}" not in forget)
-    ]
+    wanted = [run_id for run_id in finished if f"{match_id}/{run_id}" not in forget]
+    chosen = {*pinned, *wanted}
+    if keep_last is not None:
+        complete = (it for it in reversed(wanted) if store.run(match_id, it).state == "complete")
+        chosen = {*pinned, *({*wanted} & {*finished[-keep_last:]}), *islice(complete, 1)}
+    kept = [run_id for run_id in finished if run_id in chosen]
     return [run_id for run_id in finished if run_id not in kept], kept
 
 

@@ -41,7 +41,7 @@ class Finding:
     """Relative to the project."""
     problem: str
     result: ResultId | None = None
-    """The result that it belongs to; None for records and stray files."""
+    """The damaged result; None for records, foreign files, and what could not be read."""
     is_damaged_record: bool = False
     """It is a run record, reservation, registration, pin or state of the queue that is not readable
     as such."""
@@ -95,19 +95,28 @@ def repair(
 ) -> tuple[tuple[ResultId, ...], tuple[str, ...]]:
     """Withdraw damaged results and set damaged records aside; return results, and record paths.
 
-    The next run recomputes only the withdrawn results. A record that is set aside keeps its bytes
-    under another name (`damaged_path`) in the same folder, and a run keeps its number. Journal
-    entries stay: decisions of people are restored from a copy, never dropped.
+    A result is withdrawn only if a second reading finds it damaged too: its disk may have been away
+    for a moment. The next run recomputes only the withdrawn results. A record that is set aside
+    keeps its bytes under another name (`damaged_path`) in the same folder, and a run keeps its
+    number. Journal entries stay: decisions of people are restored from a copy, never dropped.
     """
     findings = list(findings)
-    results = sorted({finding.result for finding in findings if finding.result})
+    damaged = {finding.result for finding in findings if finding.result}
+    results = sorted(result for result in damaged if _is_damaged(store, result))
     for result in results:
         store.withdraw(result)
     records = sorted({finding.path for finding in findings if finding.is_damaged_record})
     for path in records:
-        store.blobs.put(damaged_path(path), store.blobs.read(path) or b"")
+        if (data := store.blobs.read(path)) is None:  # its disk is away
+            continue
+        store.blobs.put(damaged_path(path), data)
         store.blobs.delete(path)
     return tuple(results), tuple(records)
+
+
+def _is_damaged(store: Store, result: ResultId) -> bool:
+    entries = {entry.path: entry for entry in store.blobs.entries(result.path)}
+    return any(finding.result for finding in _check_result(store, result, entries))
 
 
 def _by_result(
@@ -127,13 +136,15 @@ def _by_result(
 def _check_result(
     store: Store, result: ResultId, entries: Mapping[str, Entry]
 ) -> Iterator[Finding]:
+    """Yield deviations; a file that cannot be read, or that is foreign, damages no result."""
     if result.manifest_path not in entries:
         # Not published: left by an interrupted writer in object storage; `gc` removes it.
         return
     try:
         manifest = store.manifest(result.match_id, result.stage, result.unit, result.key)
     except (StoreError, InputError) as error:
-        yield Finding(result.manifest_path, str(error), result)
+        is_damage = isinstance(error, CorruptionError)  # not a disk's error, or another version
+        yield Finding(result.manifest_path, str(error), result if is_damage else None)
         return
     if content_digest(manifest.files) != manifest.content:
         yield Finding(
@@ -143,12 +154,13 @@ def _check_result(
         try:
             verify_published(store.blobs, result, file)
         except StoreError as error:
-            yield Finding(f"{result.path}/{file.path}", str(error), result)
+            is_damage = isinstance(error, CorruptionError)
+            yield Finding(f"{result.path}/{file.path}", str(error), result if is_damage else None)
     known = {
         f"{result.path}/{name}" for name in (MANIFEST, *(file.path for file in manifest.files))
     }
     for path in entries.keys() - known:
-        yield Finding(path, "was not published with this result", result)
+        yield Finding(path, "was not published with this result")
 
 
 def _check_document(

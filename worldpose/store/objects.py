@@ -29,7 +29,7 @@ except ImportError as error:
     ) from error
 
 LISTINGS = 100
-"""Paths of which each folder is listed alone."""
+"""Folders of two parts, such as `runs/final`, of which each is listed alone."""
 
 
 @dataclass(frozen=True)
@@ -139,13 +139,13 @@ class ObjectBlobs:
         return self._list_objects(checked_path(prefix))
 
     def marks(self, paths: Sequence[str]) -> list[int]:
-        """See `Blobs`. Few listings: of the first folders if there are many paths."""
-        is_many = len(paths) > LISTINGS
+        """See `Blobs`. Few listings: of the first folders if there are many of two parts."""
         parts = [path.split("/") for path in paths]
-        ends = [1 if is_many or (len(p) == 2 and "." in p[1]) else 2 for p in parts]
-        tops = ["/".join(p[:end]) for p, end in zip(parts, ends, strict=True)]
+        tops = {"/".join(p[: 1 if len(p) == 2 and "." in p[1] else 2]) for p in parts}
+        if len(tops) > LISTINGS:
+            tops = {top.partition("/")[0] for top in tops}
         below: dict[str, list[str]] = {path: [] for path in paths}
-        for top in set(tops):
+        for top in tops:
             for entry in self.entries(top):
                 line, names = f"{entry.path} {entry.size} {entry.modified}", entry.path.split("/")
                 for end in range(1, len(names) + 1):

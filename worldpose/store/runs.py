@@ -12,7 +12,7 @@ import platform
 import re
 import tempfile
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -112,8 +112,10 @@ def alone(blobs: Blobs, what: str, *, wait: bool) -> Iterator[bool]:
     several where the file system shares its locks. Where there is none, as in object storage, those
     of one user and machine do, by a lock in the folder of temporary files.
     """
-    mine = f"worldpose-{os.getuid()}/{hashlib.sha256(blobs.url.encode()).hexdigest()[:16]}"
-    places = [Path(tempfile.gettempdir(), mine)]
+    mine = Path(tempfile.gettempdir(), f"worldpose-{os.getuid()}")
+    with suppress(OSError):
+        mine.mkdir(mode=0o700, exist_ok=True)
+    places = [mine / hashlib.sha256(blobs.url.encode()).hexdigest()[:16]]
     if "://" not in blobs.url:
         places.insert(0, Path(blobs.url, "locks"))
     with ExitStack() as stack:
@@ -131,9 +133,10 @@ def alone(blobs: Blobs, what: str, *, wait: bool) -> Iterator[bool]:
 def hold_lock(file: Path, *, wait: bool) -> Iterator[bool]:
     """Hold the lock of a file; yield whether it was acquired, which can fail without `wait`.
 
-    The operating system releases the lock when the process ends, however it ends.
+    The operating system releases the lock when the process ends, however it ends. The parent of the
+    lock's folder must exist.
     """
-    file.parent.mkdir(parents=True, exist_ok=True)
+    file.parent.mkdir(exist_ok=True)  # not its parents: a project's disk may be away
     is_of_other = file.exists() and not os.access(file, os.W_OK)  # another user's
     with file.open("r" if is_of_other else "a") as lock:
         try:

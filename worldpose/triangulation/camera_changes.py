@@ -312,6 +312,28 @@ def move_on(
     return moved
 
 
+def changed_camera(camera: Camera, frame: int, changes: Sequence[CameraChange]) -> Camera:
+    """Return a single camera as its changes turned and zoomed it in a match frame.
+
+    A zoom is one of the focal length, so that pixels differ from `move_on` by a zoomed distortion.
+    """
+    for change in reversed(changes):
+        share = float(_shares(change, np.array([frame]))[0])
+        if share > 0.0:
+            amount = np.asarray(share * _view_amount(change))
+            grown = 1.0 + amount[2]
+            turn = _view_motion(camera, amount) / [[grown], [grown], [1.0]]
+            pose = Rigid(turn, np.zeros(3)) @ camera.cam_from_world
+            camera = replace(camera, cam_from_world=pose, focal=camera.focal * grown)
+    return camera
+
+
+def left_out_frames(changes: Sequence[CameraChange], frame: Integers) -> Flags:
+    """Return the match frames (n,) in which the views of a camera with these changes are unused."""
+    unused = [_inside(change, frame) for change in changes if change.is_left_out]
+    return np.asarray(np.any([np.zeros(len(frame), np.bool_), *unused], axis=0))
+
+
 def correct_views(
     pixels: AnyFloats,
     frame: Integers,

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import AnyFloats, ClipArray, Flags, Floats, Integers
+from data_contracts.arrays import AnyFloats, ClipArray, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import Record
 from worldpose.compiled import compile_kernel, map_in_threads
@@ -23,6 +23,7 @@ from worldpose.geometry.cameras import Camera
 from worldpose.geometry.optimize.losses import geman_mcclure_weight
 from worldpose.triangulation.noise_model import NoiseModel
 from worldpose.triangulation.residuals import Observations, Rig
+from worldpose.triangulation.samples import choose_intervals, have_views
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.solve import solve_joints
 
@@ -136,27 +137,6 @@ def _standard_error(sums: PersonSums, step: Floats, inverse: Floats, unknown: fl
     alike = sums.common_score()
     variance = np.maximum((left**2).sum(axis=0), stated) + centered**2 @ alike**2
     return np.where(telling, np.sqrt(variance), unknown)
-
-
-def choose_intervals(there: Flags, length: int) -> list[slice]:
-    """Return intervals of frames with people, spread over the clip; `there` as of `have_views`."""
-    starts = np.arange(0, max(1, len(there) - length + 1), length)
-    people = np.array([there[start : start + length].any(axis=0).sum() for start in starts])
-    starts, people = starts[people > 0], people[people > 0]
-    # Person-frames in the sample.
-    wanted = max(1, 3000 // int(np.ceil(length * people.mean()))) if len(people) else 0
-    chosen = np.unique(np.linspace(0, len(starts) - 1, min(len(starts), wanted)).astype(int))
-    return [slice(int(starts[n]), int(starts[n]) + length) for n in chosen]
-
-
-def have_views(detections: KeypointDetections[ClipArray], views: int) -> Flags:
-    """Return whether at least `views` cameras see each person (frames, persons)."""
-    index, length = detections.detection_index, 512
-    parts = [
-        (index[start : start + length] >= 0).sum(axis=1) >= views
-        for start in range(0, max(1, len(index)), length)
-    ]
-    return np.concatenate(parts)
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera, Cameras
 from worldpose.ingest.clock import row_rate
 from worldpose.reference_method import require_torch
-from worldpose.triangulation.clocks import estimate_clocks, have_views, read_frames
+from worldpose.triangulation.clocks import estimate_clocks, read_frames
 from worldpose.triangulation.limb_lengths import (
     find_swaps,
     limb_lengths,
@@ -60,8 +60,9 @@ from worldpose.triangulation.results import (
     add_margins,
     concatenate_frames,
 )
+from worldpose.triangulation.samples import choose_stretches, have_views, sample_frames
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.smoothing import choose_stretches, learn_motion, smooth_joints
+from worldpose.triangulation.smoothing import learn_motion, smooth_joints
 from worldpose.triangulation.solve import SolvedJoints, solve_joints
 from worldpose.triangulation.track_solver import PersonKeypoints, select_person
 
@@ -425,32 +426,6 @@ class _Passes:
             covariance = solved.covariance + self.offset_covariance
             bias = learn_common_bias(solved.joints, covariance, bias)
         return np.full(count, bias)
-
-
-def sample_frames(there: Flags, joints: int) -> NDArray[np.int64]:
-    """Return frames to learn from: all over those with people, and some of each person.
-
-    Args:
-        there: (frames, persons), as of `have_views`.
-        joints: number of joints of a person.
-    """
-    present = there.sum(axis=1)
-    busy = np.flatnonzero(present)
-    if not len(busy):
-        return np.arange(min(1, len(there)))
-    # A confidence class then has thousands of observations.
-    chosen = _spread(busy, 1 + 6000 // int(np.ceil(present[busy].mean() * joints)))
-    # Lengths of a person's limbs need five frames.
-    for own in there.T:
-        if own[chosen].sum() < 5:
-            chosen = np.union1d(chosen, _spread(np.flatnonzero(own), 5))
-    return chosen
-
-
-def _spread(frames: NDArray[np.int64], number: int) -> NDArray[np.int64]:
-    """Return at most so many of the frames, evenly."""
-    places = np.linspace(0, len(frames) - 1, min(len(frames), number)).astype(np.int64)
-    return np.unique(frames[places])
 
 
 def _join_halves(

@@ -21,6 +21,7 @@ from worldpose.triangulation.noise_model import conditions
 from worldpose.triangulation.report import Changes, Histogram
 from worldpose.triangulation.residuals import Rig
 from worldpose.triangulation.results import MotionModel, Smoothing, Triangulation
+from worldpose.triangulation.samples import choose_stretches
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.track_solver import (
     PersonKeypoints,
@@ -103,27 +104,6 @@ def learn_motion(
     best = np.where(total.max(axis=0) > 0.0, best, 25.0)
     alike = np.maximum(correlation[1:] / energy, 0.0) if energy > 0.0 else np.zeros(lag)
     return MotionModel(best, float(1.0 + 2.0 * alike.sum()))
-
-
-def choose_stretches(there: NDArray[np.bool_], fps: float) -> list[tuple[int, slice]]:
-    """Return persons and intervals of frames to learn from, spread over the clip.
-
-    Args:
-        there: (frames, persons), whether the person can be triangulated.
-        fps: frames per second [1/s].
-    """
-    frames, persons = there.shape
-    # Length of an interval [s].
-    length = max(1, min(frames, round(2.0 * fps)))
-    every = [
-        (person, slice(start, start + length))
-        for start in range(0, max(1, frames - length + 1), length)
-        for person in range(persons)
-        if 2 * there[start : start + length, person].sum() > length
-    ]
-    # Intervals of tracks in the sample.
-    chosen = np.linspace(0, len(every) - 1, min(len(every), 12)).astype(int)
-    return [every[n] for n in np.unique(chosen)]
 
 
 def _whiten_errors(

@@ -31,12 +31,11 @@ from worldpose.triangulation.clocks import (
     SETTLED,
     MovingJoints,
     PersonSums,
-    choose_intervals,
-    have_views,
     shift_in_time,
     sum_equations,
 )
 from worldpose.triangulation.residuals import Rig
+from worldpose.triangulation.samples import choose_intervals, have_views
 from worldpose.triangulation.settings import TriangulationSettings
 
 MAX_SPAN: Final = 30

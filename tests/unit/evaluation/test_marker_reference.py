@@ -255,6 +255,15 @@ def test_places_at_another_rate_are_at_their_times(tmp_path, timed):
     assert given.frames.tolist() == list(range(29))
 
 
+def test_people_who_hardly_move_do_not_tell_the_rate_of_places_without_times(tmp_path):
+    mine, places = tracks()
+    mine = JointTracks(mine.frames - 100, mine.person_ids, np.tile(mine.joints[:1], (30, 1, 1, 1)))
+    (tmp_path / "positions.csv").write_text(wide(np.tile(places[:1], (30, 1, 1)), first=0))
+    _, given, notes = align_positions(tmp_path / "positions.csv", mine, fps=25.0)
+    assert "have no times, and people move too little to tell their rate" in notes[0]
+    assert given.frames.tolist() == list(range(30))
+
+
 @pytest.mark.parametrize(
     "form",
     ["{:.1f}", "00:00:{:02.0f}", "{:.0f}", "{:.5f}"],

@@ -76,6 +76,21 @@ def test_right_and_bottom_are_not_width_and_height(read):
         assert len(read(f"1,1,{near},1\n2,1,{near},1\n").person) == 2
 
 
+def test_right_and_bottom_are_told_of_one_person_amid_the_image(read):
+    def walk(right, bottom):
+        return "\n".join(f"{n},1,{20 + 5 * n},50,{right(n)},{bottom(n)},1" for n in range(1, 31))
+
+    with pytest.raises(InputError, match="are these right and bottom"):
+        read(walk(lambda n: 60 + 5 * n, lambda n: 170 + n % 3), (1920, 1080))
+    assert len(read(walk(lambda n: 180 + 3 * (n % 7), lambda n: 400), (1920, 1080)).person) == 30
+
+
+def test_lines_without_an_id_are_refused(read):
+    for score in (1, 0.97):
+        with pytest.raises(InputError, match=r"line 1: height: .* is the id missing"):
+            read(f"1,300,200,40,90,{score}\n2,305,200,40,90,{score}\n")
+
+
 def test_people_may_be_class_0_beside_others(read):
     found = read("1,1,10,10,5,5,1,0\n1,2,30,10,5,5,1,32\n")
     assert found.person.tolist() == [1]

@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 from run_records import calibration
 
-from data_contracts.cameras import COEFFICIENTS
 from worldpose.errors import InputError
 from worldpose.formats.calibration_forms import read_calibration
 from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.formats.lens_files import read_lens_toml, read_lenses, write_lens_toml
 from worldpose.geometry.cameras import Camera, camera_arrays, camera_from_arrays
-from worldpose.geometry.lens_fit import fit_brown_lens
 
 MATRIX = np.array([[1400.0, 0.0, 970.0], [0.0, 1404.0, 530.0], [0.0, 0.0, 1.0]])
 DISTORTION = np.array([[-0.31, 0.12, 0.001, -0.002, -0.03]])
@@ -143,6 +141,7 @@ def test_json_with_several_cameras_gives_their_lenses_by_name(form, tmp_path):
         {"resolution": "3840x2160"},
         {"img_size": "[3840, 2160]"},
         {"DIM": [3840, 2160]},
+        {"cameraResolution": [3840, 2160]},
         {"resolution": "4K UHD 3840x2160@30"},
         {"frame_size": [3840, 2160], "size": 25.0},
     ],
@@ -185,6 +184,50 @@ def test_five_numbers_in_another_order_are_refused(tmp_path, lens):
             read_lenses([file], "left", SIZES)
     file.write_text(json.dumps({"K": MATRIX.tolist(), "dist": [-0.3, 0.1, 0.012, 0.0, 0.0]}))
     assert read_lenses([file], "left", SIZES)["left"].distortion[2] == 0.012
+
+
+@pytest.mark.parametrize(
+    ("lens", "said"),
+    [
+        ([0.1, -0.05, -0.04, 0.03, 0.0], {"distortion_model": "plumb_bob"}),
+        ([0.05, -0.1, 0.03, -0.03, 0.0], {"distortion_model": "radtan"}),
+        ([0.0, -0.18, 0.033, -0.005, 0.18], {}),
+    ],
+)
+def test_large_tangential_terms_count_where_no_other_order_explains_them(tmp_path, lens, said):
+    file = tmp_path / "lens.json"
+    file.write_text(json.dumps({"K": MATRIX.tolist(), "dist": lens, **said}))
+    assert read_lenses([file], "left", SIZES)["left"].distortion == tuple(lens)
+    file.write_text(
+        json.dumps({"K": MATRIX.tolist(), "dist": [*lens[:2], 0.11, *lens[3:]], **said})
+    )
+    with pytest.raises(InputError, match=r"p1 and p2 up to"):
+        read_lenses([file], "left", SIZES)
+
+
+def test_tabs_and_matrices_without_a_type_are_read_as_opencv_and_ros_do(tmp_path):
+    text = (
+        "%YAML:1.0\nimage_width: 1920\nimage_height: 1080\ncamera_matrix: !!opencv-matrix\n"
+        "   rows: 3\n   cols: 3\n   dt: d\n"
+        "   data: [ 1400., 0., 970., 0., 1404., 530., 0., 0., 1. ]\n"
+        "distortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 5\n   dt: d\n"
+        "   data: [ -0.1, 0., 0., 0., 0. ]\n"
+        "rectification_matrix:\n   rows: 1\n   cols: 1\n   data: [ 1.0 ]\n"
+    )
+    (tmp_path / "lens.yml").write_text(text)
+    lens = read_lenses([tmp_path / "lens.yml"], "left", SIZES)["left"]
+    assert (lens.focal_px, lens.distortion) == (1402.0, (-0.1, 0.0, 0.0, 0.0, 0.0))
+    (tmp_path / "ros.yaml").write_text(
+        "K: [1400, 0, 970, 0, 1404, 530, 0, 0, 1]\t\nD: [0, 0, 0, 0]\t# px\n"
+    )
+    assert read_lenses([tmp_path / "ros.yaml"], "left", SIZES)["left"].focal_px == 1402.0
+
+
+def test_a_lens_of_another_image_size_is_told_by_its_middle_before_its_folds(tmp_path):
+    lens = {"K": [[490, 0, 330], [0, 490, 230], [0, 0, 1]], "dist": [-0.36, 0.16, 0, 0, -0.04]}
+    (tmp_path / "lens.json").write_text(json.dumps(lens))
+    with pytest.raises(InputError, match="the middle of about 661 x 461 px"):
+        read_lenses([tmp_path / "lens.json"], "left", SIZES)
 
 
 LENS = {"camera_matrix": MATRIX.tolist(), "dist": DISTORTION[0].tolist()}
@@ -454,21 +497,3 @@ def test_a_lens_whose_model_is_unknown_or_unsaid_is_refused(lens, said, tmp_path
     file.write_text(f"K: [[400, 0, 319.5], [0, 400, 239.5], [0, 0, 1]]\n{lens}\n")
     with pytest.raises(InputError, match=said):
         read_lenses([file], "a", SIZE)
-
-
-def test_records_refuse_coefficients_of_another_model():
-    for model, names in COEFFICIENTS.items():
-        with pytest.raises(ValueError, match="found 3 numbers"):
-            camera_of("fisheye", lens_model=model, distortion=(0.0,) * 3)
-        assert camera_of("fisheye", lens_model=model, distortion=(0.0,) * len(names))
-
-
-@pytest.mark.parametrize("model", LENSES)
-def test_browns_nearest_lens_states_its_largest_error(model):
-    camera = Camera.from_calibration(camera_of(model, focal_px=(700.0, 700.0)))
-    near, error = fit_brown_lens(camera)
-    rng = np.random.default_rng(0)
-    rays = camera.unproject(rng.uniform([0, 0], [639, 479], (500, 2)))
-    points = rays.origins + 5.0 * rays.directions
-    off = np.linalg.norm(near.project(points) - camera.project(points), axis=1)
-    assert 0.2 * error < off.max() <= 1.01 * error < 0.1

@@ -4,8 +4,11 @@ import cv2
 import numpy as np
 import pytest
 from camera_builders import plain_camera
+from run_records import calibration
 
+from data_contracts.cameras import COEFFICIENTS
 from worldpose.geometry.cameras import Camera
+from worldpose.geometry.lens_fit import fit_brown_lens
 from worldpose.geometry.lens_models import (
     CameraNumbers,
     LensModel,
@@ -198,3 +201,25 @@ def test_missing_pixels_and_cameras_are_missing():
     assert absent.unproject([[0.0, 0.0]]).status.tolist() == [RayStatus.MISSING]
     assert absent.project_with_jacobians([[0.0, 0.0, 1.0]]).status.tolist() == [RayStatus.MISSING]
     assert np.isnan(absent.project([[0.0, 0.0, 1.0]])).all()
+
+
+def test_records_refuse_coefficients_of_another_model():
+    for model, names in COEFFICIENTS.items():
+        with pytest.raises(ValueError, match="found 3 numbers"):
+            calibration("a", lens_model=model, distortion=(0.0,) * 3)
+        assert calibration("a", lens_model=model, distortion=(0.0,) * len(names))
+
+
+@pytest.mark.parametrize(
+    ("model", "lens"), [("fisheye", (-0.05, 0.01, -0.002, 0.0005)), ("rational", tuple(RATIONAL))]
+)
+def test_browns_nearest_lens_states_its_largest_error(model, lens):
+    stated = {"focal_px": (700.0, 700.0), "principal_point_px": (319.5, 239.5)}
+    stated |= {"image_size": (640, 480), "lens_model": model, "distortion": lens}
+    camera = Camera.from_calibration(calibration("a", **stated))
+    near, error = fit_brown_lens(camera)
+    rng = np.random.default_rng(0)
+    rays = camera.unproject(rng.uniform([0, 0], [639, 479], (500, 2)))
+    points = rays.origins + 5.0 * rays.directions
+    off = np.linalg.norm(near.project(points) - camera.project(points), axis=1)
+    assert 0.2 * error < off.max() <= 1.01 * error < 0.1

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from calibration_writers import (
     LENS,
     SIZE,
@@ -72,6 +73,15 @@ def test_a_camchain_counts_from_its_first_camera(tmp_path):
     sizes = dict.fromkeys(found, SIZE)
     lenses = read_lenses([path], None, sizes)
     np.testing.assert_allclose(lenses["cam2"].distortion, (*LENS[:4], 0.0))
+    # As OpenVINS and VINS have it: with OpenCV's head, rows in one list, and the IMU's place.
+    chain = yaml.safe_load(path.read_text()) | {"T_imu_body": [1.0, 0.0]}
+    for name in ("cam1", "cam2"):
+        chain[name]["T_cn_cnm1"] = np.ravel(chain[name]["T_cn_cnm1"]).tolist()
+    path.write_text(f"%YAML:1.0\n\n{yaml.safe_dump(chain)}")
+    assert list(read_calibration(path)) == [*read_lenses([path], None, sizes)] == [*found]
+    (tmp_path / "one").mkdir()
+    with pytest.raises(InputError, match=r"found one camera, at the origin: .* import --lens"):
+        read_calibration(write_kalibr(tmp_path / "one", known[:1]))
     path.write_text(path.read_text().replace("pinhole", "omni"))
     with pytest.raises(InputError, match="found omni with radtan"):
         read_calibration(path)

@@ -214,6 +214,23 @@ def test_a_pitch_in_yards_is_told_from_wrong_clicks():
             calibrated(clicked, pitch=pitch)
 
 
+def test_few_careless_clicks_do_not_make_a_pitch_in_yards():
+    # Five clicks with three times the stated noise: both sizes fit them without an outlier.
+    scenario, rng = SCENARIOS["penalty-box"], np.random.default_rng([1020, 0])
+    target = np.array([*scenario.crowd.area_center_m, 0.0])
+    target[2] = people.PITCH.height(*target[:2])
+    camera = place_camera(scenario.rig, 0, target, PitchSpec(), rng)
+    empty = np.empty((0, 17, 3))
+    clicked = click(
+        camera, people.PITCH, empty, scenario.clicks, clustered=True, mistaken=False, rng=rng
+    ).markings
+    surveyed = PitchTemplate.from_spec(survey(PitchSpec(), 0.006, rng))
+    assert len(clicked.points) == 5
+    estimate = calibrate_camera(surveyed, clicked, people.SIZE).estimate
+    squared, freedom = people.surprise_of(estimate, camera)
+    assert squared < chi2.ppf(0.999, freedom)
+
+
 SPREAD_OUT = ClickSettings()
 FEW = ClickSettings(clustered=1.0, clustered_points=(5, 7))
 

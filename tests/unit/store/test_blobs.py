@@ -165,4 +165,13 @@ def test_a_file_below_a_folder_of_object_storage_has_a_mark(name):
     blobs.put(name, b"22")
     (after,) = blobs.marks([name])
     assert 0 not in (before, after) and before != after
-    assert blobs.marks([name] * (objects.LISTINGS + 1))[0] == after
+    many = [f"runs/{number}" for number in range(objects.LISTINGS + 1)]
+    assert blobs.marks([name, *many])[0] == after
+
+
+def test_marks_of_one_match_list_no_other_match(monkeypatch):
+    listed = []
+    monkeypatch.setattr(objects.ObjectBlobs, "entries", lambda _, top: listed.append(top) or [])
+    paths = [f"results/final/tracking/clip{number}" for number in range(objects.LISTINGS + 1)]
+    objects.ObjectBlobs("bucket", "").marks(["runs/final", *paths])
+    assert sorted(listed) == ["results/final", "runs/final"]

@@ -21,6 +21,7 @@ from store_samples import (
 
 from data_contracts.pin import Pin
 from worldpose.errors import CorruptionError, InputError, StoreError
+from worldpose.store.blobs import LocalBlobs
 from worldpose.store.documents import canonical_json, digest, seal
 from worldpose.store.garbage import collect, plan_gc
 from worldpose.store.integrity import repair, verify
@@ -93,7 +94,7 @@ def test_foreign_file_is_found(full):
         full.blobs.put(path, b"foreign")
     findings = verify(full)
     assert [finding.path for finding in findings] == sorted(foreign)
-    assert repair(full, findings)[1] == (), "it is not ours to move"
+    assert repair(full, findings) == ((), ()), "it is not ours to move, and damages no result"
 
 
 def test_foreign_files_break_no_reader(full):
@@ -152,6 +153,27 @@ def test_repair_withdraws_what_is_damaged_and_nothing_else(full):
     assert full.has(*place(sample_recipe("late")))
     publish(full)
     assert verify(full) == ()
+
+
+@pytest.mark.parametrize("what", ["EIO", "away", "version"])
+def test_repair_keeps_results_that_it_cannot_read(full, monkeypatch, what):
+    result, results = ResultId(*place()), full.results()
+    read = LocalBlobs._read
+
+    def fail(blobs, path, how):
+        if what == "away":
+            return None if path.startswith(f"{result.path}/joints") else read(blobs, path, how)
+        raise StoreError(f"{path}: Input/output error")
+
+    if what == "version":
+        rewrite(full, result.manifest_path, lambda fields: fields.update(mood="good"))
+    else:
+        monkeypatch.setattr(LocalBlobs, "_read", fail)
+    found = verify(full)
+    assert any(result.path in finding.path for finding in found)
+    monkeypatch.setattr(LocalBlobs, "_read", read)
+    assert repair(full, found) == ((), ())
+    assert full.results() == results
 
 
 def test_unfinished_run_is_seen_and_is_not_the_latest(folder_store):
@@ -231,6 +253,17 @@ def test_a_pinned_run_and_its_results_outlast_all_others(two_runs):
     assert {item.reason for item in plan.garbage} == {"run forgotten", "no kept run reaches it"}
     collect(two_runs, plan)
     assert two_runs.runs("final") == ("0002",)
+
+
+def test_the_newest_complete_run_outlasts_newer_ones_that_failed(two_runs):
+    for _ in range(2):
+        number = two_runs.reserve_run("final")
+        two_runs.finish_run(sample_record(number, sample_recipe("first"), state="failed"))
+    collect(two_runs, plan_gc(two_runs, keep_last=1, older_than=PLAN_NOW))
+    assert two_runs.runs("final") == ("0002", "0004")
+    assert two_runs.has(*place(sample_recipe("second")))
+    plan = plan_gc(two_runs, keep_last=1, forget=["final/0002"], older_than=PLAN_NOW)
+    assert plan.garbage[0].path == "runs/final/0002.json"
 
 
 def test_a_run_that_is_pinned_after_planning_is_not_removed(two_runs):

@@ -12,15 +12,15 @@ from worldpose.geometry.rigid import Rigid, Similarity
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
-from worldpose.triangulation.clocks import choose_intervals, estimate_clocks, move_to_match_time
+from worldpose.triangulation.clocks import estimate_clocks, move_to_match_time
 from worldpose.triangulation.estimate import (
     MARGIN,
     learn_clip,
     reconstruct_chunks,
     reconstruct_joints,
-    sample_frames,
     triangulate_joints,
 )
+from worldpose.triangulation.samples import choose_intervals, sample_frames
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.smoothing import smooth_joints
 from worldpose.triangulation.synchronization import synchronize

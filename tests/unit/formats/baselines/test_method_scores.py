@@ -10,6 +10,7 @@ from method_files import FIRST, FRAMES, STEP, WALK, WRITERS, scene, truth_of, wo
 from flows.cli.evaluate import named_rates
 from flows.results.baselines import score_methods, table_csv, table_latex, table_rows
 from worldpose.body.model import BodyParameters
+from worldpose.dataset.manifest import write_frame_rates
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.baselines import METHODS
 from worldpose.formats.joints_file import write_joints
@@ -125,6 +126,8 @@ def test_a_file_of_every_second_picture_scores_as_one_of_all(tmp_path):
         score_methods([f"smpl={path}"], str(tmp_path), fps=50.0, seen_fps={"tram": 25.0})
     with pytest.raises(UsageError, match="--fps"):
         score_methods([f"smpl={path}"], str(tmp_path), seen_fps={"smpl": 25.0})
+    write_frame_rates(tmp_path, {"clip": 50.0})
+    assert score_methods([f"smpl={path}"], str(tmp_path), seen_fps={"smpl": 25.0}) == (score,)
 
 
 @pytest.mark.parametrize("text", ["gvhmr", "gvhmr=", "gvhmr=x", "gvhmr=0", "gvhmr=-3", "gvhmr=inf"])
