@@ -11,7 +11,7 @@ from camera_builders import look_at_camera
 
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import CameraChange
-from tasks import clip_inputs, filtering, refitting
+from tasks import clip_inputs, filtering, refitting, tracking
 from tasks.clip_inputs import ADJUSTED, PAGE, StoredFeedback, open_detections
 from worldpose.body.body_file import find_body
 from worldpose.body_fitting.monocular import MonocularEstimates
@@ -391,3 +391,14 @@ def test_names_give_a_shape_only_to_people_who_can_be_the_same(monkeypatch):
     assert known[1].betas[0] == pytest.approx(1.1)
     (differ,) = result.warnings  # person 99 can be tracked, without a body
     assert "person 2 of clip a and person 1 of clip b are both named rice and differ" in differ
+
+
+def test_a_camera_whose_people_meet_nobody_is_named_unless_a_change_explains_it(monkeypatch):
+    monkeypatch.setattr(tracking, "find_lone_views", lambda *_: {0: 2, 1: 3})
+    detections = SimpleNamespace(frame=np.arange(40, 50))
+    clip = SimpleNamespace(camera_ids=("a", "b"), cameras=None, detections=detections, fps=25.0)
+    change = CameraChange(
+        camera="a", kind="view", frame=42, first_frame=40, frame_count=10, std=0.1
+    )
+    moved, lone = tracking._describe_changes(clip, SimpleNamespace(joints=None), [change])
+    assert moved.startswith("camera a") and lone.startswith("camera b: from frame 43 on most")
