@@ -152,20 +152,26 @@ def verify(store: Store, mend: Annotated[bool, typer.Option("--repair")] = False
     with console.progress() as reporter:
         findings = verify_store(store, progress=reporter.bytes_read)
     withdrawn, set_aside = repair(store, findings) if mend else ((), ())
+    gone = tuple(f"{result.path}/" for result in withdrawn)
+    left = [it for it in findings if it.path not in set_aside and not it.path.startswith(gone)]
     console.print_json(
         {
             "findings": [{"path": each.path, "problem": each.problem} for each in findings],
             "withdrawn": [each.path for each in withdrawn],
             "set_aside": list(set_aside),
+            "left": [each.path for each in left],
         }
     )
     for finding in findings:
-        console.line(f"damaged: {finding.path}: {finding.problem}", to=console.errors)
+        is_left = mend and finding in left
+        told = f"{'left' if is_left else 'found'}: {finding.path}: {finding.problem}"
+        again = "; a second reading did not find it" * (is_left and finding.can_be_repaired)
+        console.line(told + again, to=console.errors)
     for result in withdrawn:
         console.line(f"withdrawn: {result.path}", to=console.errors)
     for path in set_aside:
         console.line(f"set aside: {damaged_path(path)}", to=console.errors)
-    if findings and not mend:
+    if not mend and any(finding.can_be_repaired for finding in findings):
         console.errors.print(
             "worldpose verify --repair withdraws damaged results and sets damaged records aside; "
             "then run the match again"

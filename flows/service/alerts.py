@@ -231,6 +231,7 @@ class AlertDispatcher:
 
     def _keep(self) -> None:
         try:
+            self.state.folder.stat()  # its disk may be away: then nothing is written in its place
             with self._writing, whole_file(self.state.alerts) as draft:
                 draft.write_text(json.dumps(self._told, indent=2) + "\n")
         except OSError as error:  # the full disk can be the cause of the alert

@@ -31,6 +31,7 @@ from flows.service.plan import ServePlan, deployment_names
 from flows.service.run_queue import FIXED, find_process, queued_run
 from worldpose.errors import InputError
 from worldpose.store.run_queue import ENDED, RunQueue, queue_of
+from worldpose.store.store import Store
 
 STARTING: Final = timedelta(minutes=5)
 """Maximum time from the start of a run's process until the run is active, on an overloaded
@@ -50,7 +51,11 @@ def recover(plan: ServePlan, *, at_start: bool = False) -> list[str]:
 
     One process at a time recovers; a second one returns at once. At the start of the worker, runs
     that seem to start were killed with the previous one.
+
+    Raises:
+        InputError: the project's disk is away; nothing is written in its place.
     """
+    Store.open(plan.project)
     with plan.state_folder.only_one("recovery", wait=at_start) as is_alone:
         if not is_alone:
             return []
@@ -213,7 +218,11 @@ class Liveness:
         Args:
             now: of the monotonic clock [s].
             wall: of the machine's clock [s].
+
+        Raises:
+            InputError: the project's disk is away; nothing is written in its place.
         """
+        Store.open(self.plan.project)
         self._held = {key: each for key, each in self._held.items() if each[1] > now}
         if now - self._looked > 120.0:  # the machine was asleep, and so were the runs
             self._since.clear()

@@ -62,7 +62,11 @@ def watch(plan: ServePlan) -> None:
 
         bucket = BucketInbox(plan.bucket, plan.inbox, state)
         settle = plan.settle_seconds
-        fetch = lambda: bucket.fetch(time.monotonic(), settle)  # noqa: E731
+
+        def fetch() -> None:
+            Store.open(plan.project)  # as in `_look_at_inbox`
+            bucket.fetch(time.monotonic(), settle)
+
         _start(BUCKET, BUCKET_SECONDS, fetch)
     liveness = Liveness(plan)
     unset = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # macOS has the second alone
@@ -144,6 +148,7 @@ def _hold_alerts(
     queue = queue_of(plan.project)
 
     def hold() -> None:
+        Store.open(plan.project)  # if its disk is away, no alert is over
         end = time.monotonic() + READING_SECONDS
         while is_late(matches := overview.look(LOOK_SECONDS)) and time.monotonic() < end:
             STEPS["looking for alerts"] = time.monotonic()  # it makes progress

@@ -28,6 +28,7 @@ from flows.service.layout import StateFolder
 from flows.service.plan import ServePlan
 from flows.service.watching import Trouble
 from worldpose.errors import UsageError
+from worldpose.store.store import Store
 
 NOW = datetime.now(UTC)
 ABSENT = Channel("absent", "http://127.0.0.1:9/secret")
@@ -39,6 +40,7 @@ def hook(webhook):
 
 def tell(folder, channel, *alerts):
     """Hold alerts and deliver them once, as after a restart; return the pause that follows [s]."""
+    folder.mkdir(exist_ok=True)
     dispatcher = AlertDispatcher(StateFolder(folder), [channel])
     dispatcher.hold(alerts)
     return dispatcher.deliver(channel)
@@ -402,6 +404,7 @@ def test_alerts_of_two_sources_do_not_end_each_other(tmp_path):
 
 def test_alerts_are_sent_though_some_matches_are_never_read(plan, tmp_path, monkeypatch):
     match = MatchSummary(match_id="m", is_unseen=True)
+    Store.create(plan.project)
     state = StateFolder(tmp_path)
     former = Alert("quality/m/weak", "quality", "m is weak", match_id="m")
     over = Alert("quality/n/weak", "quality", "n is weak", match_id="n")

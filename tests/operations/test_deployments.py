@@ -46,7 +46,7 @@ def plan(server, tmp_path_factory):
     """A plan whose deployments are installed."""
     # One folder, however often a process comes back to these tests: the server serves one project.
     folder = tmp_path_factory.getbasetemp() / "of-deployments"
-    folder.mkdir(exist_ok=True)
+    Store.create(folder)
     plan = ServePlan(
         project=str(folder),
         inbox=folder,

@@ -11,8 +11,10 @@ from types import SimpleNamespace
 
 import pytest
 
+from flows.overview import Overview
 from flows.registering import find_match, open_for_review, open_match, open_stored
 from flows.service import deployed, watching
+from flows.service.alerts import Alert, AlertDispatcher
 from flows.service.inbox import (
     MOST_FILES,
     RefusalError,
@@ -24,7 +26,7 @@ from flows.service.inbox import (
 )
 from flows.service.layout import StateFolder
 from flows.service.plan import ServePlan
-from flows.service.recovery import recover
+from flows.service.recovery import Liveness, recover
 from worldpose.errors import InputError
 from worldpose.simulation.matches import MatchOptions, simulate_match
 from worldpose.simulation.scenarios import SCENARIOS
@@ -109,11 +111,19 @@ def test_an_id_is_never_another_match_that_its_folder_holds_now(desk, drop):
     assert find_match(desk.store, str(folder)).match_id == "other"
 
 
-def test_a_project_whose_disk_is_away_is_not_made_anew(desk, drop, tmp_path):
+@pytest.mark.parametrize("is_mount_point", [False, True])
+def test_a_project_whose_disk_is_away_is_not_made_anew(desk, drop, tmp_path, is_mount_point):
     drop()
     project = Path(desk.store.url).rename(tmp_path / "away").with_name("project")
+    if is_mount_point:
+        project.mkdir()
     plan = ServePlan(project=desk.store.url, inbox=desk.inbox, state=desk.state.folder, prefect="")
+    dispatcher = AlertDispatcher(plan.state_folder, ())
+    dispatcher.hold([Alert("watch_stalled", "watch_stalled", "late")], source="steps")
+    hold = watching._hold_alerts(plan, Overview(desk.store), dispatcher, Liveness(plan))
     for step in (
+        hold,
+        lambda: Liveness(plan).look(0.0, 0.0),
         lambda: deployed.ingest.fn(plan.model_dump(mode="json")),
         lambda: watching.watch(plan),
         lambda: watching._look_at_inbox(plan),
@@ -121,7 +131,8 @@ def test_a_project_whose_disk_is_away_is_not_made_anew(desk, drop, tmp_path):
     ):
         with pytest.raises((InputError, FileNotFoundError)):
             step()
-        assert not project.exists()
+        assert project.exists() == is_mount_point
+        assert not [*project.rglob("*")]
 
 
 def test_a_growing_match_waits_until_nothing_has_changed(desk, drop, clock):

@@ -75,8 +75,13 @@ def test_a_damaged_record_hides_no_other_match(two, record):
     assert states["second"] == "not run"
     assert worldpose("gc", "--project", two / "project").code == 0
     register(Store.open(two / "project"), two / "second")
+    stray = two / "project" / "results" / "notes.txt"
+    stray.parent.mkdir(exist_ok=True)
+    stray.write_text("x")
     answer = worldpose("verify", "--repair", "--project", two / "project")
     assert answer.code == 1
+    assert "left: results/notes.txt: is not part of any result; remove it" in answer.err
+    stray.unlink()
     assert f"set aside: {record}.damaged" in answer.err
     assert worldpose("verify", "--project", two / "project").code == 0
     answer = worldpose("status", "--project", two / "project")

@@ -32,7 +32,7 @@ class GcPlan:
 
     garbage: tuple[Garbage, ...]
     held: tuple[str, ...]
-    """One sentence per skipped match: a run of it may be in progress, or a record is damaged."""
+    """One sentence per skipped match: a run of it may be in progress, or a record is unreadable."""
     runs: frozenset[str]
     """The run records, reservations and pins known to the plan."""
 
@@ -55,8 +55,9 @@ def plan_gc(
     is kept, however old. Recent results and leftovers are kept; results are also kept while a run
     of their match may be in progress, which may be about to name them, and leftovers while any run
     may be. Reservations are kept while they hold the highest number, so that no number is reused
-    unless `forget` frees it. A match with a damaged run record, reservation, pin or manifest is
-    skipped, because the results that its runs reach are unknown. Planning removes nothing.
+    unless `forget` frees it. A match is skipped if a kept run's record, a reservation, pin or
+    manifest is damaged or of another version: the results that its runs reach are unknown. A record
+    that `keep_last` drops need not be readable. Planning removes nothing.
 
     Args:
         store: the project.
@@ -82,7 +83,7 @@ def plan_gc(
             for run_id in kept:
                 _add_reached_results(store, store.run(match_id, run_id), reached)
             reservations = list(_reservations(store, match_id, sizes))
-        except CorruptionError as error:
+        except (CorruptionError, InputError) as error:
             damaged[match_id] = f"Match {match_id} is skipped: {error}"
             continue
         for run_id in dropped:
@@ -189,10 +190,17 @@ def _select_runs(
     wanted = [run_id for run_id in finished if f"{match_id}/{run_id}" not in forget]
     chosen = {*pinned, *wanted}
     if keep_last is not None:
-        complete = (it for it in reversed(wanted) if store.run(match_id, it).state == "complete")
+        complete = (it for it in reversed(wanted) if _is_complete(store, match_id, it))
         chosen = {*pinned, *({*wanted} & {*finished[-keep_last:]}), *islice(complete, 1)}
     kept = [run_id for run_id in finished if run_id in chosen]
     return [run_id for run_id in finished if run_id not in kept], kept
+
+
+def _is_complete(store: Store, match_id: str, run_id: str) -> bool:
+    try:
+        return store.run(match_id, run_id).state == "complete"
+    except (CorruptionError, InputError):  # if it is kept, its match is skipped
+        return False
 
 
 def _reservations(

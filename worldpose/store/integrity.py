@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Final
 
 from data_contracts.match import Registration
 from data_contracts.operations import Heartbeat, QueuedRun
@@ -29,6 +30,8 @@ from worldpose.store.writer import content_digest
 Progress = Callable[[int, int], None]
 """Called with the number of verified bytes, and the total."""
 
+FOREIGN: Final = "remove it: it is not the project's"
+
 SealedEntry = tuple[JournalEntry, str]
 """A journal entry, and the checksum in its document."""
 
@@ -45,6 +48,11 @@ class Finding:
     is_damaged_record: bool = False
     """It is a run record, reservation, registration, pin or state of the queue that is not readable
     as such."""
+
+    @property
+    def can_be_repaired(self) -> bool:
+        """Whether `repair` withdraws or sets aside what has it; the rest is for people to do."""
+        return self.result is not None or self.is_damaged_record
 
 
 def verify(
@@ -70,7 +78,7 @@ def verify(
     done = 0
     findings: list[Finding] = []
     groups, strays = _by_result(results)
-    findings.extend(Finding(path, "is not part of any result") for path in strays)
+    findings.extend(Finding(path, f"is not part of any result; {FOREIGN}") for path in strays)
     for result, entries in groups.items():
         findings.extend(_check_result(store, result, entries))
         done += sum(entry.size for entry in entries.values())
@@ -95,8 +103,8 @@ def repair(
 ) -> tuple[tuple[ResultId, ...], tuple[str, ...]]:
     """Withdraw damaged results and set damaged records aside; return results, and record paths.
 
-    A result is withdrawn only if a second reading finds it damaged too: its disk may have been away
-    for a moment. The next run recomputes only the withdrawn results. A record that is set aside
+    Both happen only if a second reading finds the damage too: the disk may have been away for a
+    moment. The next run recomputes only the withdrawn results. A record that is set aside
     keeps its bytes under another name (`damaged_path`) in the same folder, and a run keeps its
     number. Journal entries stay: decisions of people are restored from a copy, never dropped.
     """
@@ -105,13 +113,15 @@ def repair(
     results = sorted(result for result in damaged if _is_damaged(store, result))
     for result in results:
         store.withdraw(result)
-    records = sorted({finding.path for finding in findings if finding.is_damaged_record})
-    for path in records:
-        if (data := store.blobs.read(path)) is None:  # its disk is away
-            continue
-        store.blobs.put(damaged_path(path), data)
-        store.blobs.delete(path)
-    return tuple(results), tuple(records)
+    set_aside = []
+    for path in sorted({finding.path for finding in findings if finding.is_damaged_record}):
+        again = _check_document(store, path, set(), {})
+        is_damaged = any(finding.is_damaged_record for finding in again)
+        if is_damaged and (data := store.blobs.read(path)) is not None:
+            store.blobs.put(damaged_path(path), data)
+            store.blobs.delete(path)
+            set_aside.append(path)
+    return tuple(results), tuple(set_aside)
 
 
 def _is_damaged(store: Store, result: ResultId) -> bool:
@@ -160,7 +170,7 @@ def _check_result(
         f"{result.path}/{name}" for name in (MANIFEST, *(file.path for file in manifest.files))
     }
     for path in entries.keys() - known:
-        yield Finding(path, "was not published with this result")
+        yield Finding(path, f"was not published with this result; {FOREIGN}")
 
 
 def _check_document(
@@ -196,7 +206,7 @@ def _check_document(
                 record = unseal(RunRecord, data, where)
                 fits = (match_id, name) == (record.match_id, f"{record.run_id}.json")
                 yield from _check_named_results(record, path, published)
-            case ["reviews", match_id, name] if name.endswith(".json"):
+            case ["reviews", match_id, name] if _is_json(name):
                 entry = unseal(JournalEntry, data, where)
                 fits = (match_id, name) == (entry.match_id, f"{entry.number:06d}.json")
                 journals.setdefault(match_id, []).append((entry, read_checksum(data)))
@@ -213,13 +223,15 @@ def _check_document(
                 queued = unseal(QueuedRun, data, where)
                 fits = path == queue_path(queued)
             case _:
-                raise CorruptionError(f"{where} is not a file of a project")
+                yield Finding(path, f"is not a file of a project; {FOREIGN}")
+                return
         if not fits:
             raise CorruptionError(
                 f"{where} holds the record of another match, run, entry or pin than its path says"
             )
     except CorruptionError as error:
-        yield Finding(path, str(error), is_damaged_record=is_record)
+        restore = "; restore it from a copy" if parts[0] in ("reviews", PROJECT) else ""
+        yield Finding(path, f"{error}{restore}", is_damaged_record=is_record)
     except (StoreError, InputError) as error:
         yield Finding(path, str(error))
 
@@ -234,7 +246,7 @@ def _check_chain(entries: list[SealedEntry]) -> Iterator[Finding]:
     for entry, checksum in sorted(entries, key=lambda sealed: sealed[0].number):
         if entry.previous != tip:
             path = f"reviews/{entry.match_id}/{entry.number:06d}.json"
-            yield Finding(path, "its previous entry is missing or damaged")
+            yield Finding(path, "its previous entry is missing or damaged; restore it from a copy")
         tip = checksum
 
 
@@ -244,4 +256,4 @@ def _check_named_results(
     for name, key in record.results.items():
         result = ResultId.from_name(record.match_id, name, key)
         if result not in published:
-            yield Finding(path, f"names {result.path}, which is not published")
+            yield Finding(path, f"names {result.path}, which is not published; run the match again")

@@ -94,6 +94,7 @@ def test_foreign_file_is_found(full):
         full.blobs.put(path, b"foreign")
     findings = verify(full)
     assert [finding.path for finding in findings] == sorted(foreign)
+    assert all("remove it: it is not" in finding.problem for finding in findings)
     assert repair(full, findings) == ((), ()), "it is not ours to move, and damages no result"
 
 
@@ -114,6 +115,17 @@ def test_foreign_files_break_no_reader(full):
     plan = plan_gc(full, older_than=timedelta(0))
     assert [each.path for each in plan.garbage if not each.path.startswith("staging")] == []
     assert full.reserve_run("final") == "0003"
+
+
+@pytest.mark.parametrize("now", [None, True])
+def test_repair_leaves_a_record_that_is_gone_or_whole_at_a_second_reading(full, now):
+    record = "matches/final.json"
+    whole = flip(full, record, 3)
+    findings = verify(full)
+    full.blobs.put(record, whole) if now else full.blobs.delete(record)
+    assert (len(findings), repair(full, findings)) == (1, ((), ()))
+    assert full.blobs.read(record) == (whole if now else None)
+    assert not full.blobs.exists(f"{record}.damaged")
 
 
 def test_repair_sets_damaged_records_aside_and_readers_go_on(full):
@@ -264,6 +276,27 @@ def test_the_newest_complete_run_outlasts_newer_ones_that_failed(two_runs):
     assert two_runs.has(*place(sample_recipe("second")))
     plan = plan_gc(two_runs, keep_last=1, forget=["final/0002"], older_than=PLAN_NOW)
     assert plan.garbage[0].path == "runs/final/0002.json"
+
+
+@pytest.mark.parametrize("number", ["0002", "0004"])
+@pytest.mark.parametrize("is_damaged", [True, False])
+def test_an_unreadable_record_is_not_complete_and_does_not_end_the_planning(
+    two_runs, number, is_damaged
+):
+    for _ in range(2):
+        failed = two_runs.reserve_run("final")
+        two_runs.finish_run(sample_record(failed, sample_recipe("first"), state="failed"))
+    record = f"runs/final/{number}.json"
+    if is_damaged:
+        flip(two_runs, record, 3)
+    else:
+        rewrite(two_runs, record, lambda fields: fields.update(mood="good"))
+    plan = plan_gc(two_runs, keep_last=1, older_than=PLAN_NOW)
+    if number == "0004":  # it is kept, and what it reaches is unknown
+        assert (plan.garbage, len(plan.held), record in plan.held[0]) == ((), 1, True)
+    else:
+        collect(two_runs, plan)
+        assert (plan.held, two_runs.runs("final")) == ((), ("0001", "0004"))
 
 
 def test_a_run_that_is_pinned_after_planning_is_not_removed(two_runs):
