@@ -329,6 +329,7 @@ def test_another_project_of_the_same_name_is_refused(plan):
 def lonely(plan, tmp_path):
     """The plan with a queue of its own, and its runs."""
     own = plan.model_copy(update={"project": str(tmp_path), "state": tmp_path / "operations"})
+    Store.create(own.project)
     return own, MatchRuns.of_plan(own)
 
 
