@@ -224,7 +224,7 @@ class _Loader(yaml.SafeLoader):
 
 def _load_yaml(text: str) -> Any:  # noqa: ANN401
     # The head of OpenCV's files, also of camchains, is none of YAML's.
-    text = re.sub(r"\A%YAML:.*", "", text)
+    text = re.sub(r"\A%YAML[: ].*", "", text)
     try:
         return _parse_yaml(text)
     except yaml.scanner.ScannerError:
