@@ -351,7 +351,7 @@ def plain_key(key: str) -> str:
 
 
 def read_model(where: str, given: Mapping[str, Any]) -> tuple[bool, bool]:
-    """Return whether a lens's entries say, under any usual name, a fisheye, or OpenCV's order.
+    """Return whether a lens's entries say, under any usual name, a fisheye, or a word of one order.
 
     Raises:
         InputError: one names another lens model than those of OpenCV, or two contradict.
@@ -377,7 +377,6 @@ def read_model(where: str, given: Mapping[str, Any]) -> tuple[bool, bool]:
     if yes and no:
         found = ", ".join(f"{key} {word}" for word, key in said.items())
         raise calibration_error(where, "one lens model", found)
-    # These words have one order of coefficients everywhere.
     return bool(yes), bool(no & {"plumb_bob", "radtan", "pinhole_radtan", "rational_polynomial"})
 
 
