@@ -210,7 +210,7 @@ def test_large_tangential_terms_count_where_no_other_order_explains_them(tmp_pat
 def test_tabs_and_matrices_without_a_type_are_read_as_opencv_and_ros_do(tmp_path):
     text = (
         "%YAML:1.0\nimage_width: 1920\nimage_height: 1080\ncamera_matrix: !!opencv-matrix\n"
-        "   rows: 3\n   cols: 3\n   dt: d\n   data: [1400., 0., 970., 0., 1404., 530., 0., 0., 1.]\n"
+        "   rows: 3\n   cols: 3\n   dt: d\n   data: [1400, 0, 970, 0, 1404, 530, 0, 0, 1]\n"
         "distortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 5\n   dt: d\n"
         "   data: [ -0.1, 0., 0., 0., 0. ]\n"
         "rectification_matrix:\n   rows: 1\n   cols: 1\n   data: [ 1.0 ]\n"
