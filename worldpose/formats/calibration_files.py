@@ -351,7 +351,7 @@ def plain_key(key: str) -> str:
 
 
 def read_model(where: str, given: Mapping[str, Any]) -> tuple[bool, bool]:
-    """Return whether a lens's entries say, under any usual name, that it is a fisheye, or is none.
+    """Return whether a lens's entries say, under any usual name, a fisheye, or a word of one order.
 
     Raises:
         InputError: one names another lens model than those of OpenCV, or two contradict.
@@ -377,17 +377,17 @@ def read_model(where: str, given: Mapping[str, Any]) -> tuple[bool, bool]:
     if yes and no:
         found = ", ".join(f"{key} {word}" for word, key in said.items())
         raise calibration_error(where, "one lens model", found)
-    return bool(yes), bool(no - {"0", "0.0", "false"})
+    return bool(yes), bool(no & {"plumb_bob", "radtan", "pinhole_radtan", "rational_polynomial"})
 
 
 def _read_lens(
-    where: str, numbers: NDArray[np.float64], fisheye: bool, is_named: bool
+    where: str, numbers: NDArray[np.float64], fisheye: bool, is_ordered: bool
 ) -> tuple[NDArray[np.float64], LensName]:
     """Return coefficients in OpenCV's order, and their model; OpenCV writes up to 14 numbers."""
     # Maximum p1 and p2 [1]; real lenses have 0.005, webcams up to 0.02. Four numbers name no k3.
     # Poor calibrations reach 0.07: their k3 is larger than what another order has in its place.
     k3, p = (np.abs(each).max(initial=0.0) for each in (numbers[4:5], numbers[2:4]))
-    max_tangential = 0.1 if is_named or k3 > p else 0.01 if len(numbers) == 4 else 0.025
+    max_tangential = 0.1 if is_ordered or k3 > p else 0.01 if len(numbers) == 4 else 0.025
     is_rational = not fisheye and bool(np.any(numbers[5:8] != 0))
     model: LensName = "fisheye" if fisheye else "rational" if is_rational else "brown"
     names = COEFFICIENTS[model]

@@ -341,6 +341,7 @@ def _read_easymocap(
             f"dist_{name}": lenses.get(f"dist_{name}", lenses.get(f"D_{name}")),
             f"R_{name}": poses.get(f"R_{name}", poses.get(f"Rot_{name}")),
             f"T_{name}": poses.get(f"T_{name}"),
+            "distortion_model": "plumb_bob",  # the program writes OpenCV's order alone
         }
         for key, value in entries.items():
             if value is None:
@@ -383,6 +384,7 @@ def _read_biocv(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
             "size": numbers[:2],
             "K": np.array(numbers[2:11]).reshape(3, 3).tolist(),
             "distortion": numbers[27:],
+            "distortion_model": "plumb_bob",
             "rotation of L": pose[:3, :3].tolist(),
             "translation of L": pose[:3, 3].tolist(),
         }

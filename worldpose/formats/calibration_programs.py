@@ -210,6 +210,7 @@ def read_openpose_cameras(
             for key in ("Intrinsics", "Distortion")
             if key in given
         }
+        table |= {"distortion_model": "plumb_bob"}  # the program writes OpenCV's order alone
         table |= {"size": list(size), "R": pose[:, :3].tolist(), "t": pose[:, 3].tolist()}
         keys = Keys("size", "Intrinsics", "Distortion", "R", "t")
         camera = read_camera_table(where, file.stem, table, keys=keys)

@@ -7,7 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from data_contracts.cameras import CameraCalibration
+from data_contracts.cameras import CameraCalibration, LensCalibration
+
+
+def order_entry(lens: CameraCalibration | LensCalibration) -> list[str]:
+    """Return the TOML line that says the order of coefficients; none if readers do not doubt it."""
+    # p1 and p2 up to here [1] are of OpenCV's order without saying so.
+    if lens.lens_model == "fisheye" or max(map(abs, lens.distortion[2:4])) <= 0.01:
+        return []
+    return ['distortion_model = "plumb_bob"']
 
 
 def write_calibration_toml(path: Path, calibrations: Mapping[str, CameraCalibration]) -> None:
@@ -31,6 +39,7 @@ def write_calibration_toml(path: Path, calibrations: Mapping[str, CameraCalibrat
             f"rotation = {rotvec.tolist()}",
             f"translation = {list(camera.translation)}",
             f"fisheye = {str(camera.lens_model == 'fisheye').lower()}",
+            *order_entry(camera),
             "",
         ]
     lines += ["[metadata]", "adjusted = false", "error = 0.0", ""]

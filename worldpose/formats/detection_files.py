@@ -192,11 +192,14 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
     # it as sides of boxes.
     cut = ((boxes[:, 2:] - size > 0.1 * box[:, 2:]).any(axis=1)) & is_person
     is_corner = (box[is_person, 2:] > box[is_person, :2]).all()
-    # So does the right side follow the left one, as no width does, where people move about.
+    # So does the right side follow the left one, as no width does, where people move about: read
+    # as widths, these are wide for a person's height, or change much more than it [1].
     left, right = box[is_person][:, [0, 2]].T
     enough = 10  # boxes
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore"):
+        shape = np.log(right / box[is_person, 3])
         follows = len(left) >= enough and np.std(right - left) < 0.3 * np.std(right)
+        follows = follows and (np.mean(shape) > np.log(2 / 3) or np.std(shape) > 0.3)
     is_corner &= follows or cut.sum() > 0.2 * len(cut)
     within = (box[:, 2:] <= np.array(size) + 1.0).all(axis=1) & is_person
     is_corner &= within.sum() > 0.9 * is_person.sum()

@@ -223,10 +223,19 @@ class _Loader(yaml.SafeLoader):
 
 
 def _load_yaml(text: str) -> Any:  # noqa: ANN401
-    # The head of OpenCV's files, also of camchains, is none of YAML's. YAML allows tabs before a
-    # comment and at the end of a line; the parser does not.
-    text = re.sub(r"\A%YAML:.*", "", text)
-    text = re.sub(r"\t[ \t]*(?=#|$)", " ", text, flags=re.MULTILINE)
+    # The head of OpenCV's files, also of camchains, is none of YAML's.
+    text = re.sub(r"\A%YAML[: ].*", "", text)
+    try:
+        return _parse_yaml(text)
+    except yaml.scanner.ScannerError:
+        # YAML allows tabs before a comment and at the end of a line; the parser does not.
+        spaced = re.sub(r"(?<![ \t])[ \t]++(?=#|$)", " ", text, flags=re.MULTILINE)
+        if "\t" not in text or spaced == text:
+            raise
+        return _parse_yaml(spaced)
+
+
+def _parse_yaml(text: str) -> Any:  # noqa: ANN401
     # Events arrive one by one, so that the check rejects a bomb before construction.
     depth = 0
     for count, event in enumerate(yaml.parse(text, Loader=yaml.SafeLoader)):

@@ -235,8 +235,10 @@ def order_by_points(where: str, points: AnyFloats, stated: str | None = None) ->
     misfits = [_misfit(order.select(points), pairs, _LENGTHS) for order in orders]
     chosen = orders[0]
     for order, misfit in zip(orders, misfits, strict=True):
-        # An order that lacks the limbs, of NaN, explains nothing.
-        if misfit <= wrong and not misfits[0] - misfit < _MARGIN:
+        # An order that lacks the limbs, of NaN, explains nothing. Where the first one lacks them,
+        # they may be hidden: there is no comparison, and the other has to fit well.
+        most = plausible if np.isnan(misfits[0]) else wrong
+        if misfit <= most and not misfits[0] - misfit < _MARGIN:
             chosen = order
     if size == len(COCO17):
         other = _misfit(points, np.reshape(_HUMAN36M, (5, 2, 2)), _HUMAN36M_LENGTHS)

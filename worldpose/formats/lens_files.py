@@ -30,6 +30,7 @@ from worldpose.formats.calibration_files import (
     require_optics,
 )
 from worldpose.formats.calibration_unit import require_middle, square_focal
+from worldpose.formats.calibration_writer import order_entry
 from worldpose.formats.files import (
     SETTINGS_BYTES,
     by_last_number,
@@ -169,6 +170,7 @@ def write_lens_toml(path: Path, lenses: Mapping[str, LensCalibration]) -> None:
             f"principal_point_std_px = {lens.principal_point_std_px}",
             f"distortion_std = {lens.distortion_std}",
             *(["fisheye = true"] if lens.lens_model == "fisheye" else []),
+            *order_entry(lens),
             "",
         ]
     path.write_text("\n".join(lines), encoding="utf-8")
@@ -235,6 +237,8 @@ def read_opencap(file: Path) -> dict[str, Any]:
     given = {str(key): value for key, value in content.items()}
     if np.size(given.get("imageSize", ())) == 2:
         given["imageSize"] = np.ravel(given["imageSize"])[::-1]
+    if "intrinsicMat" in given:
+        given.setdefault("distortion_model", "plumb_bob")  # the program writes OpenCV's order alone
     return given
 
 
@@ -305,7 +309,7 @@ def kalibr_tables(
             "size": given.get("resolution", []),
             "matrix": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]],
             "distortions": given.get("distortion_coeffs") or [0.0] * 4,
-            **({"fisheye": True} if lens == "equidistant" else {}),
+            "distortion_model": lens,
         }
         if not posed:
             yield name, table

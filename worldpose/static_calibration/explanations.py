@@ -196,9 +196,7 @@ def check_agreement(
         exact = scale_noise(problem, 1.0 / factor, settings)[0]
         size = _find_size(exact, pitch, stated)
         # Without outliers, clicks that are less exact than stated fit another size by chance.
-        if size is not None and (
-            wrong > 0.2 or _fits_better(_start_on_pitch(exact, pitch, size, stated), found, stated)
-        ):
+        if size is not None and (wrong > 0.2 or _fits_better(exact, pitch, size, found, stated)):
             raise _size_error(problem, pitch, size)
     if wrong > settings.max_wrong_share:
         kept = [n for n, inlier in zip(evidence.points, fit.inliers, strict=True) if inlier]
@@ -235,20 +233,21 @@ def check_unit(
     With lens distortion and one or two outliers, the clicks also fit a pitch that is 9 % too large.
     """
     size = _size_in_yards(pitch)
-    # A score of points alone decides nothing where drawn markings also constrain the camera.
-    if problem.evidence.markings:
-        return
-    if _fits_better(_start_on_pitch(problem, pitch, size, settings), best, settings):
+    if _fits_better(problem, pitch, size, best, settings):
         raise _size_error(problem, pitch, size)
 
 
 def _fits_better(
-    start: tuple[CameraProblem, Floats] | None,
+    problem: CameraProblem,
+    pitch: PitchTemplate,
+    size: _PitchSize,
     best: Explanation,
     settings: StaticCalibrationSettings,
 ) -> bool:
-    """Return whether a fit from a start on another pitch is far more probable than the best one."""
-    if start is None:
+    """Return whether a pitch of another size is far more probable than the best explanation."""
+    start = _start_on_pitch(problem, pitch, size, settings)
+    # A score of points alone decides nothing where drawn markings also constrain the camera.
+    if start is None or problem.evidence.markings:
         return False
     points, row = start
     try:

@@ -32,9 +32,9 @@ def sample_frames(there: Flags, joints: int) -> NDArray[np.int64]:
         return np.arange(min(1, len(there)))
     # A confidence class then has thousands of observations.
     chosen = _spread(busy, 1 + 6000 // int(np.ceil(present[busy].mean() * joints)))
-    # Lengths of a person's limbs need five frames.
-    for own in there.T:
-        if own[chosen].sum() < 5:
+    # Lengths of a person's limbs need five frames; memory bounds these, the longest tracks first.
+    for own in there.T[np.argsort(-there.sum(axis=0), kind="stable")]:
+        if len(chosen) < 512 and own[chosen].sum() < 5:
             chosen = np.union1d(chosen, _spread(np.flatnonzero(own), 5))
     return chosen
 

@@ -82,7 +82,14 @@ def test_right_and_bottom_are_told_of_one_person_amid_the_image(read):
 
     with pytest.raises(InputError, match="are these right and bottom"):
         read(walk(lambda n: 60 + 5 * n, lambda n: 170 + n % 3), (1920, 1080))
-    assert len(read(walk(lambda n: 180 + 3 * (n % 7), lambda n: 400), (1920, 1080)).person) == 30
+    for width, height in (
+        (lambda n: 180 + 3 * (n % 7), lambda _: 400),
+        (lambda n: 80 + 5 * n, lambda _: 400),  # left edge and width grow together
+        (lambda n: 80 + 5 * n, lambda n: 200 + 13 * n),  # and the height: the person comes nearer
+    ):
+        assert len(read(walk(width, height), (1920, 1080)).person) == 30
+    lines = [f"{n},1,{5 + 2 * n},20,{60 + 2 * n},300,1" for n in range(1, 40)]
+    assert len(read("\n".join(lines), (1920, 1080)).person) == 39
 
 
 def test_lines_without_an_id_are_refused(read):

@@ -178,12 +178,12 @@ def test_entries_that_are_no_size_leave_the_videos_size(tmp_path, entry):
 @pytest.mark.parametrize("lens", [[0.05, -0.02, 0.03, -0.015, 0.0], [-0.28, 0.09, -0.04, 0, 0]])
 def test_five_numbers_in_another_order_are_refused(tmp_path, lens):
     file = tmp_path / "lens.json"
-    for further in (0, 3, 7, 9):
-        file.write_text(json.dumps({"K": MATRIX.tolist(), "dist": lens + [0.0] * further}))
+    words = (None, "brown", "brown3t2", "polynomial", "radial_tangential")
+    for further, word in zip((0, 3, 7, 9, 0), words, strict=True):
+        content = {"K": MATRIX.tolist(), "dist": lens + [0.0] * further, "distortion_model": word}
+        file.write_text(json.dumps(content))
         with pytest.raises(InputError, match=r"p1 and p2 up to 0.025"):
             read_lenses([file], "left", SIZES)
-    file.write_text(json.dumps({"K": MATRIX.tolist(), "dist": [-0.3, 0.1, 0.012, 0.0, 0.0]}))
-    assert read_lenses([file], "left", SIZES)["left"].distortion[2] == 0.012
 
 
 @pytest.mark.parametrize(
@@ -197,10 +197,12 @@ def test_five_numbers_in_another_order_are_refused(tmp_path, lens):
 def test_large_tangential_terms_count_where_no_other_order_explains_them(tmp_path, lens, said):
     file = tmp_path / "lens.json"
     file.write_text(json.dumps({"K": MATRIX.tolist(), "dist": lens, **said}))
-    assert read_lenses([file], "left", SIZES)["left"].distortion == tuple(lens)
-    file.write_text(
-        json.dumps({"K": MATRIX.tolist(), "dist": [*lens[:2], 0.11, *lens[3:]], **said})
-    )
+    found = read_lenses([file], "left", SIZES)
+    assert found["left"].distortion == tuple(lens)
+    write_lens_toml(tmp_path / "lenses.toml", found)
+    assert read_lens_toml(tmp_path / "lenses.toml", SIZES) == found
+    dist = [*lens[:2], 0.11, *lens[3:]]
+    file.write_text(json.dumps({"K": MATRIX.tolist(), "dist": dist, **said}))
     with pytest.raises(InputError, match=r"p1 and p2 up to"):
         read_lenses([file], "left", SIZES)
 
@@ -208,18 +210,17 @@ def test_large_tangential_terms_count_where_no_other_order_explains_them(tmp_pat
 def test_tabs_and_matrices_without_a_type_are_read_as_opencv_and_ros_do(tmp_path):
     text = (
         "%YAML:1.0\nimage_width: 1920\nimage_height: 1080\ncamera_matrix: !!opencv-matrix\n"
-        "   rows: 3\n   cols: 3\n   dt: d\n"
-        "   data: [ 1400., 0., 970., 0., 1404., 530., 0., 0., 1. ]\n"
+        "   rows: 3\n   cols: 3\n   dt: d\n   data: [1400, 0, 970, 0, 1404, 530, 0, 0, 1]\n"
         "distortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 5\n   dt: d\n"
         "   data: [ -0.1, 0., 0., 0., 0. ]\n"
         "rectification_matrix:\n   rows: 1\n   cols: 1\n   data: [ 1.0 ]\n"
     )
-    (tmp_path / "lens.yml").write_text(text)
-    lens = read_lenses([tmp_path / "lens.yml"], "left", SIZES)["left"]
-    assert (lens.focal_px, lens.distortion) == (1402.0, (-0.1, 0.0, 0.0, 0.0, 0.0))
-    (tmp_path / "ros.yaml").write_text(
-        "K: [1400, 0, 970, 0, 1404, 530, 0, 0, 1]\t\nD: [0, 0, 0, 0]\t# px\n"
-    )
+    for head in ("%YAML:1.0", "%YAML 1.0"):
+        (tmp_path / "lens.yml").write_text(text.replace("%YAML:1.0", head))
+        lens = read_lenses([tmp_path / "lens.yml"], "left", SIZES)["left"]
+        assert (lens.focal_px, lens.distortion) == (1402.0, (-0.1, 0.0, 0.0, 0.0, 0.0))
+    text = "K: [1400, 0, 970, 0, 1404, 530, 0, 0, 1]\t\nD: [0, 0, 0, 0]\t# px\n"
+    (tmp_path / "ros.yaml").write_text(text)
     assert read_lenses([tmp_path / "ros.yaml"], "left", SIZES)["left"].focal_px == 1402.0
 
 

@@ -29,6 +29,7 @@ from scipy.spatial.transform import Rotation
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import LeftOut
 from worldpose.formats.calibration_forms import FORMS, read_calibration, read_cameras
+from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.formats.lens_files import read_lenses
 from worldpose.triangulation.world import place_cameras, read_stated_world
 
@@ -57,6 +58,19 @@ def test_known_cameras_are_read_back(tmp_path, form):
     (folder / "Config.toml").write_text("[project]\n")
     (folder / "notes.md").write_text("# notes\n")
     assert list(read_cameras(folder)) == [one.id for one in known]
+
+
+@pytest.mark.parametrize("form", ["OpenCap", "EasyMocap", "bioCV", "OpenPose", "Kalibr"])
+def test_large_tangential_terms_of_programs_with_one_order_come_back_and_go_out(tmp_path, form):
+    writers = {**WRITERS, "OpenPose": write_openpose, "Kalibr": write_kalibr}
+    lens = (0.1, -0.05, -0.02, 0.027, 0.0)
+    path = writers[form](tmp_path, rig(lens=lens))
+    read = read_calibration(path, dict.fromkeys(("a1", "b2", "c3"), SIZE))
+    assert [one.distortion for one in read.values()] == [pytest.approx(lens)] * 3
+    write_calibration_toml(tmp_path / "c.toml", read)
+    assert [one.distortion for one in read_calibration(tmp_path / "c.toml").values()] == [
+        one.distortion for one in read.values()
+    ]
 
 
 def test_a_camchain_counts_from_its_first_camera(tmp_path):

@@ -17,6 +17,7 @@ from data_contracts.match import CameraSpec
 from worldpose.errors import InputError
 from worldpose.formats.calibration_forms import read_calibration
 from worldpose.formats.calibration_writer import write_calibration_toml
+from worldpose.ingest import registration
 from worldpose.ingest.clock import camera_frames, remaining_offset, simplest_offset
 from worldpose.ingest.footage import UnitFrames, read_unit
 from worldpose.ingest.importing import import_match, import_videos
@@ -360,14 +361,14 @@ def test_an_empty_file_is_refused(folder):
 
 
 def test_a_file_that_changes_while_it_is_read_is_refused(folder, monkeypatch):
-    digest = hashlib.file_digest
+    digest = registration.sha256_of_file
 
-    def grow(file, name):
+    def grow(path):
         with (folder / "videos" / "cam1.mp4").open("ab") as video:
             video.write(b"more")
-        return digest(file, name)
+        return digest(path)
 
-    monkeypatch.setattr(hashlib, "file_digest", grow)
+    monkeypatch.setattr(registration, "sha256_of_file", grow)
     with pytest.raises(InputError, match="still being written"):
         register(folder)
 

@@ -226,9 +226,12 @@ def test_few_careless_clicks_do_not_make_a_pitch_in_yards():
     ).markings
     surveyed = PitchTemplate.from_spec(survey(PitchSpec(), 0.006, rng))
     assert len(clicked.points) == 5
-    estimate = calibrate_camera(surveyed, clicked, people.SIZE).estimate
-    squared, freedom = people.surprise_of(estimate, camera)
-    assert squared < chi2.ppf(0.999, freedom)
+    lines = people.draw(camera, ["goal_line_left"], rng, count=8, noise=3.0)
+    for drawn in ((), lines):
+        also = ClickedMarkings(points=clicked.points, drawn=drawn)
+        estimate = calibrate_camera(surveyed, also, people.SIZE).estimate
+        squared, freedom = people.surprise_of(estimate, camera)
+        assert squared < chi2.ppf(0.9999, freedom)
 
 
 SPREAD_OUT = ClickSettings()

@@ -113,12 +113,14 @@ def test_clocks_are_unknown_where_nobody_is_seen_by_two_cameras(ring):
 
 
 def test_samples_are_of_frames_with_people_and_of_each_person():
-    there = np.zeros((9000, 300), bool)
-    for person in range(300):
-        there[3000 + 20 * person : 3010 + 20 * person, person] = True
+    there = np.zeros((9000, 70), bool)
+    there[3000:, :30] = True
+    for visitor in range(40):
+        there[3000 + 90 * visitor : 3010 + 90 * visitor, 30 + visitor] = True
     chosen = sample_frames(there, 17)
     assert there[chosen].sum(axis=0).min() >= 5
     assert there[chosen].any(axis=1).all()
+    assert len(chosen) <= 512
     assert min(part.start for part in choose_intervals(there, 25)) >= 2975
 
 
