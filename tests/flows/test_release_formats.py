@@ -402,7 +402,8 @@ def test_other_methods_get_our_boxes_as_mot_lines(match_folder, tmp_path, caplog
     with_joints = replace(run, run=origin(match_folder, **tracked()).run)
     with pytest.raises(InputError, match="found 25 images per second, and 50 frames"):
         _write_clip(with_joints, "A_1", "m_A_1", "train", tmp_path / "released", "none")
-    assert [path.name for path in write("worldpose", run, tmp_path / "slower")] == ["A_1.npz"]
+    names = [path.name for path in write("worldpose", run, tmp_path / "slower")]
+    assert names == ["A_1.npz", "A_1.json"]
     assert not (tmp_path / "slower" / "cameras").exists() and "view A_1" in caplog.text
     settings = BaselineSettings.model_validate_json(written[0].read_bytes())
     assert (settings.slahmr_max_num_tracks, settings.slahmr_chunk_frames) == (30, 100)
