@@ -18,9 +18,11 @@ from flows.reports.broadcast import (
 from flows.reports.match_pictures import frame_pictures, shown_pitch
 from flows.results.best_results import Origin, body_tracks, joint_tracks, placed_joints
 from flows.results.run_cameras import broadcast_views, static_cameras
-from flows.results.tool_exports import image_views
+from flows.results.tool_exports import ImageView, image_views
 from flows.stage import Match
+from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
+from worldpose.reports.bodies import BodyTracks
 from worldpose.reports.videos import overlay_frames
 from worldpose.store.store import Run, Store
 from worldpose.video.files import write_video
@@ -69,17 +71,30 @@ def write_clip_video(
     view = next(view for view in views if view.name == owner)
     cameras = Camera.stack([view.camera_in(frame) for frame in frames.tolist()])
     width, height = view.camera.image_size.tolist()
-    tracks = replace(tracks, joints=view.at_images(tracks.joints))
+    tracks, bodies = people_at_images(run, clip, tracks, view)
 
     def pictures() -> Iterator[Image]:
         for picture in frame_pictures(store, match, owner, frames.tolist()):
             dark = np.zeros((height, width, 3), dtype=np.uint8)  # where the camera has no frame
             yield dark if picture is None else picture
 
-    bodies = body_tracks(run, clip)
     pitch = shown_pitch(run, match)
     drawn = overlay_frames(pictures(), cameras, tracks, frames, pitch, bodies)
     write_video(file, drawn, match.folder.spec.fps / video_step(match), quality=23)
+
+
+def people_at_images(
+    run: Run, clip: str, tracks: JointTracks, view: ImageView
+) -> tuple[JointTracks, BodyTracks | None]:
+    """Return a clip's best joints and bodies, if any, where they are in a camera's images.
+
+    Bodies move as a whole: between a match frame and its image they keep their pose.
+    """
+    bodies = body_tracks(run, clip)
+    if bodies is not None:
+        poses = replace(bodies.poses, transl=view.at_images(bodies.poses.transl))
+        bodies = replace(bodies, poses=poses)
+    return replace(tracks, joints=view.at_images(tracks.joints)), bodies
 
 
 def video_frames(run: Run, match: Match, clip: str, owner: str) -> Integers:

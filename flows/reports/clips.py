@@ -9,10 +9,10 @@ import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.pitch import PitchSpec
+from flows.reports.clip_video import people_at_images
 from flows.reports.match_pictures import background_image, frame_picture, shown_pitch
 from flows.results.best_results import (
     Origin,
-    body_tracks,
     clip_title,
     joint_tracks,
     placed_joints,
@@ -57,7 +57,9 @@ def clip_pictures(
     pictures = []
     if len(tracks.frames):
         first = int(tracks.frames[0])
-        widest = list(cameras)[int(seen[0].argmax())]
+        view = _static_views(run, match, clip, tracks)[int(seen[0].argmax())]
+        widest, camera = view.name, view.camera_in(first)
+        shown, bodies = people_at_images(run, clip, tracks, view)
         image = _image_with_people(store, match, widest, first)
         here = f"{clip_title(clip)}, frame {first}"
         beneath = "" if image is None else ", over its image"
@@ -65,18 +67,15 @@ def clip_pictures(
             CaptionedImage(
                 f"{here}, from camera {widest}: markings and reconstructed people, "
                 f"projected by the estimated camera{beneath}.",
-                plot_camera_view(
-                    cameras[widest], f"camera {widest}", tracks, 0, still=image, pitch=pitch
-                ),
+                plot_camera_view(camera, f"camera {widest}", shown, 0, still=image, pitch=pitch),
             ),
             CaptionedImage(
                 f"{here}, from above. The more cameras see a place, the darker it is.",
                 plot_stadium(cameras, "", tracks, pitch=pitch),
             ),
         ]
-        bodies = body_tracks(run, clip)
         if bodies is not None:
-            pictures.append(_bodies(store, bodies, match, clip, (widest, cameras[widest]), pitch))
+            pictures.append(_bodies(store, bodies, match, clip, (widest, camera), pitch))
     above = plot_paths(tracks, truth=truth, cameras=cameras, pitch=pitch)
     pictures.append(CaptionedImage(f"{clip_title(clip)}: the paths of all people.", above))
     return pictures
@@ -166,7 +165,7 @@ def _plot_view(
             detected["boxes"].values, detected["keypoints"].values, tracked[tracked >= 0]
         ),
         ReconstructedPeople(
-            view.at_images(tracks.joints)[row],
+            view.at_images(tracks.joints, np.array([row]))[0],
             tracks.person_ids,
             tracked >= 0 if seen is None else seen,
         ),
@@ -200,7 +199,7 @@ def worst_views(run: Run, match: Match, clip: str, tracks: JointTracks) -> list[
     for c, view in enumerate(_static_views(run, match, clip, tracks)):
         seen = run[seen_in(run, match, view.name, clip)]["keypoints"].reindex(frame=numbers).values
         own = np.take_along_axis(seen, np.maximum(place[:, c], 0)[..., None, None], axis=1)
-        found = view.project(tracks.joints)[rows]
+        found = view.show(tracks.joints, rows)
         off = np.linalg.norm(own - found, axis=-1)
         height = np.ptp(found[..., 1], axis=-1)
         enough = (np.isfinite(off).sum(-1) >= MIN_JOINTS) & (place[:, c] >= 0)
@@ -222,7 +221,8 @@ def disagreement_pictures(store: Store, run: Run, match: Match, clip: str) -> li
     views = _static_views(run, match, clip, tracks)
     pictures = []
     for row, index, person, percent in worst_views(run, match, clip, tracks):
-        name, pixels = views[index].name, views[index].project(tracks.joints)[row, person]
+        name = views[index].name
+        pixels = views[index].show(tracks.joints[:, [person]], np.array([row]))[0, 0]
         side = _CROP_HEIGHTS * float(np.ptp(pixels[:, 1])) * np.array([1.6, 1.0])
         part = pixels.mean(axis=0) - 0.5 * side, side
         pictures.append(

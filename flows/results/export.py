@@ -51,7 +51,7 @@ from worldpose.formats.tables import write_positions
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_fit import fit_brown_lens
 from worldpose.geometry.lens_models import LensModel
-from worldpose.ingest.footage import image_clock
+from worldpose.ingest.footage import image_clock, unit_frames
 from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.runs import pin_run, read_pin
@@ -60,8 +60,8 @@ from worldpose.video.files import write_video
 
 LENS_ERRORS = "lens_errors.json"
 """Largest differences of the lenses in cameras/ from those of the run [px]."""
-CAMERA_CHANGES = "camera_changes.json"
-"""How the views of static cameras change within each clip; files in cameras/ are from before."""
+CAMERA_CHANGES = "camera_changes"
+"""Folder of how static cameras' views change within each clip; cameras/ is from before."""
 PITCH_SPACING = 0.5
 """Spacing of the points in pitch_points.txt [m]."""
 
@@ -79,13 +79,14 @@ def export_worldpose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
 
     A clip without people has cameras alone. A moving camera of another frame rate than the match is
     left out. Other lenses than Brown's are fitted by it; `lens_errors.json` states the largest
-    error, and `camera_changes.json` how static cameras change within a clip.
+    error, and `camera_changes/<clip>.json` how static cameras change within a clip.
 
     Raises:
         InputError: a clip has people and no bodies.
     """
     with_people = best_results.find_clips(origin.run.record)
-    others = bool(with_people or origin.static_cameras)
+    rates = (unit_frames(origin.spec, view).rate for view in broadcast_views(origin.run))
+    others = bool(with_people or origin.static_cameras) or 1.0 in rates
     for clip in best_results.all_clips(origin.run):
         if clip in with_people:
             model, poses, _ = best_results.fitted_bodies(origin.run, clip)
@@ -98,9 +99,9 @@ def export_worldpose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
             path = out / "cameras" / f"{view}.npz"
             write_moving_camera(path, camera)
             yield path
-    found = {clip: view_changes(origin.run, clip) for clip in best_results.all_clips(origin.run)}
-    if told := {clip: [each.model_dump() for each in own] for clip, own in found.items() if own}:
-        path = out / CAMERA_CHANGES
+        path = out / CAMERA_CHANGES / f"{clip}.json"  # without changes, too: it replaces others
+        path.parent.mkdir(parents=True, exist_ok=True)
+        told = [each.model_dump() for each in view_changes(origin.run, clip)]
         path.write_text(json.dumps(told, indent=1), encoding="utf-8")
         yield path
     errors: dict[str, dict[str, str | float]] = {}

@@ -35,7 +35,9 @@ def read_owners(folder: Path) -> dict[str, str]:
         owners = {}
     manifest = read_manifest(folder)
     if manifest is not None:
-        released = (MANIFEST, *(file.path for file in manifest.files))
+        files = {file.path for file in manifest.files}
+        entries = (f"{name}: {clip}" for name in SHARED & files for clip in manifest.clips)
+        released = (MANIFEST, *files, *entries)
         owners |= dict.fromkeys(released, f"{RELEASE}{manifest.release} of {manifest.match_id}")
     return owners
 

@@ -240,21 +240,27 @@ class ImageView:
             LOG.warning(text, clip, self.name)
         return not is_unused
 
-    def at_images(self, points: Floats) -> Floats:
-        """Return points (frames, ...) at the moments of the images.
+    def at_images(self, points: Floats, rows: Integers | None = None) -> Floats:
+        """Return points (frames, ...) at the moments of the images, in some rows or in all.
 
         x(t) = x(f) + (t - f) v, with the step v per frame to the next frame if t > f, else from the
         one before; the other one, or none, where that is not known.
         """
-        if not self.late.any():
-            return points
-        step = np.diff(points, axis=0)
-        gap = np.full((1, *points.shape[1:]), np.nan)
-        ahead, back = np.concatenate([step, gap]), np.concatenate([gap, step])
-        share = self.late.reshape(-1, *(1,) * (points.ndim - 1))
-        speed, other = np.where(share > 0, ahead, back), np.where(share > 0, back, ahead)
-        speed = np.where(np.isfinite(speed), speed, other)
-        return np.asarray(points + share * np.where(np.isfinite(speed), speed, 0.0))
+        at = np.arange(len(points)) if rows is None else rows
+        here, late = points if rows is None else points[rows], self.late[at]
+        if not late.any():
+            return here
+        shape = (-1, *(1,) * (points.ndim - 1))
+
+        def speed(side: Integers) -> Floats:
+            near = np.clip(at + side, 0, len(points) - 1)
+            step = side.reshape(shape) * (points[near] - here)
+            return np.where((near == at).reshape(shape), np.nan, step)
+
+        toward = np.where(late > 0, 1, -1)
+        wanted, other = speed(toward), speed(-toward)
+        wanted = np.where(np.isfinite(wanted), wanted, other)
+        return np.asarray(here + late.reshape(shape) * np.nan_to_num(wanted))
 
     def move(self, pixels: Floats) -> Floats:
         """Return pixels (frames, ..., 2) of the unchanged camera where the images show them."""
@@ -268,6 +274,14 @@ class ImageView:
         """Return pixels (frames, ..., 2) of points (frames, ..., 3) [m] at the images' moments."""
         pixels = self.camera.project(points.reshape(len(points), -1, 3))
         return self.move(pixels.reshape(*points.shape[:-1], 2))
+
+    def show(self, points: Floats, rows: Integers) -> Floats:
+        """Return pixels (rows, ..., 2) of a static camera's images in some rows.
+
+        The points (frames, ..., 3) [m] are those of all match frames.
+        """
+        part = replace(self, frame=self.frame[rows], number=self.number[rows], late=self.late[rows])
+        return part.project(self.at_images(points, rows))
 
 
 def image_views(

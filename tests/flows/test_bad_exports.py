@@ -7,6 +7,7 @@ import re
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from typer.testing import CliRunner
 from data_contracts.release import EXPORT_FORMATS, EXPORT_PURPOSES
 from flows.cli.app import app
 from flows.results import export as export_module
+from flows.results import outputs
 from flows.results.export import CLASHING, COUNTED, EXPORTS, export
 from flows.results.outputs import OWNERS
 from worldpose.errors import InputError, UsageError, WorldposeError
@@ -56,6 +58,21 @@ def without_joints():
 
 
 CASES = {"nothing": dict, "nobody": nobody, "one frame": one_frame, "no joint": without_joints}
+
+
+def test_no_entry_of_a_release_changes(tmp_path, monkeypatch):
+    (tmp_path / "kinds.json").write_text('{"A": {"1": "plane"}}')
+    outputs.record_owner(tmp_path, {}, "m", {"kinds.json: A": "m"})  # as before the release
+    files = [SimpleNamespace(path="kinds.json")]
+    manifest = SimpleNamespace(release="v1", match_id="m", clips={"A": None}, files=files)
+    monkeypatch.setattr(outputs, "read_manifest", lambda _: manifest)
+    draft = tmp_path / "draft.json"
+    draft.write_text('{"A": {"1": "mixed"}, "B": {"1": "plane"}}')
+    for owner in ("m", "other"):
+        for force in (False, True):
+            with pytest.raises(InputError, match="of release v1 of m"):
+                outputs.own_whole(tmp_path, {"kinds.json": draft}, "A", (owner,), overwrite=force)
+        outputs.own_whole(tmp_path, {"kinds.json": draft}, "B", (owner,), overwrite=False)
 
 
 @pytest.mark.parametrize("case", CASES)

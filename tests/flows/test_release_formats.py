@@ -14,6 +14,7 @@ from stand_ins import empty_store
 
 from data_contracts.release import BaselineSettings
 from flows.reports import clips
+from flows.reports.clip_video import people_at_images
 from flows.results import best_results
 from flows.results.best_results import Origin
 from flows.results.data_set_release import _write_clip
@@ -160,9 +161,84 @@ def test_images_that_a_run_leaves_out_are_no_labels_of_an_empty_pitch(
 def test_files_of_cameras_state_that_a_view_changes(match_folder, tmp_path):
     run = origin(match_folder, **static_rig({"frame": 102, "shift_px": (30.0, 0.0)}))
     written = {path.name: path for path in write("worldpose", run, tmp_path)}
-    assert json.loads(written["camera_changes.json"].read_text())["A_1"][0]["frame"] == 102
+    assert json.loads(written["A_1.json"].read_text())[0]["frame"] == 102
     (scene,) = write("gltf", run, tmp_path)
     assert b"camera north moves at frame 102, by 30 px" in scene.read_bytes()
+
+
+def test_changes_of_cameras_are_those_of_the_last_run_and_of_each_match(match_folder, tmp_path):
+    out, run = tmp_path / "out", origin(match_folder, **static_rig({"frame": 102}))
+    told = out / "camera_changes" / "A_1.json"
+    export(run, ["worldpose"], out)
+    before = told.read_bytes()
+    theirs = {name.replace("A_1", "B_1"): data for name, data in static_rig().items()}
+    other = origin(match_folder, **theirs)
+    clip = run.spec.clips[0].model_copy(update={"id": "B_1"})
+    other.registration.spec = run.spec.model_copy(update={"match_id": "other", "clips": (clip,)})
+    export(other, ["worldpose"], out)
+    assert json.loads((told.parent / "B_1.json").read_text()) == []
+    assert told.read_bytes() == before != b"[]"
+    export(origin(match_folder, **static_rig()), ["worldpose"], out)
+    assert json.loads(told.read_text()) == []
+
+
+def test_a_camera_of_another_frame_rate_is_left_out_where_others_are_written(
+    match_folder, tmp_path, caplog
+):
+    known = {f"broadcast_calibration__{name}": broadcast() for name in ("A_1", "B_1")}
+    known["broadcast_calibration__B_1"].attrs["clip_id"] = "B_1"
+    run = origin(match_folder, **known)
+    clips_ = [run.spec.clips[0]]
+    clips_.append(clips_[0].model_copy(update={"id": "B_1", "broadcast": "half"}))
+    half = run.spec.cameras[1].model_copy(update={"id": "half", "fps": 25.0})
+    update = {"clips": tuple(clips_), "cameras": (*run.spec.cameras, half)}
+    run.registration.spec = run.spec.model_copy(update=update)
+    export(run, ["worldpose"], tmp_path / "out")
+    assert [path.name for path in (tmp_path / "out/cameras").iterdir()] == ["A_1.npz"]
+    assert "left out: view B_1" in caplog.text
+    del run.run.results["broadcast_calibration/A_1"]
+    with pytest.raises(InputError, match="view B_1: expected the frame rate of the match"):
+        export(run, ["worldpose"], tmp_path / "none")
+
+
+def test_the_report_compares_people_at_the_moments_of_the_images(match_folder, monkeypatch):
+    results = static_rig()
+    results["body_fitting__A_1"]["joints"] *= 0.1  # into the image
+    index = np.tile(np.arange(2), (4, 1, 1))
+    results["tracking__A_1"]["detection_index"] = (("frame", "camera", "person"), index)
+    run = origin(match_folder, **results)
+    north = run.spec.cameras[0].model_copy(update={"offset_frames": 0.4})
+    spec = run.spec.model_copy(update={"cameras": (north, *run.spec.cameras[1:])})
+    run.registration.spec = spec
+    (view,) = image_views(run, "A_1", FRAMES)
+    tracks = best_results.joint_tracks(run.run, "A_1")
+    seen = view.project(view.at_images(tracks.joints))
+    run.run.results["detection/north"] = xr.Dataset(
+        {"keypoints": (("frame", "detection", "joint", "axis"), seen)}, coords={"frame": FRAMES}
+    )
+    for rows in ([0], [1, 3], [0, 1, 2, 3]):
+        np.testing.assert_array_equal(view.show(tracks.joints, np.array(rows)), seen[rows])
+    monkeypatch.setattr(clips, "seen_in", lambda *_: "detection/north")
+    match = SimpleNamespace(registration=run.registration)
+    found = clips.worst_views(run.run, match, "A_1", tracks)
+    assert [percent for *_, percent in found] == [0, 0]
+    monkeypatch.setattr(clips, "frame_picture", lambda *_: None)
+    monkeypatch.setattr(clips, "_plot_view", lambda *_, part: part)
+    (first, _) = clips.disagreement_pictures(None, run.run, match, "A_1")
+    corner, side = first.png
+    row, _, person, _ = found[0]
+    np.testing.assert_allclose(corner + 0.5 * side, seen[row, person].mean(axis=0))
+
+
+def test_bodies_are_drawn_at_the_moments_of_the_images(match_folder):
+    moving = bodies()
+    moving["transl"][:, :, 0] += 0.1 * np.arange(4)[:, None]
+    run = origin(match_folder, **(static_rig() | {"body_fitting__A_1": moving}))
+    (view,) = image_views(run, "A_1", FRAMES)
+    view = replace(view, late=np.full(4, 0.4))
+    tracks = best_results.joint_tracks(origin(match_folder, **static_rig()).run, "A_1")
+    _, drawn = people_at_images(run.run, "A_1", tracks, view)
+    np.testing.assert_allclose(drawn.poses.transl[:, 0, 0], 0.1 * np.arange(4) + 0.04)
 
 
 @pytest.mark.parametrize("is_explained", [True, False])
@@ -326,7 +402,8 @@ def test_other_methods_get_our_boxes_as_mot_lines(match_folder, tmp_path, caplog
     with_joints = replace(run, run=origin(match_folder, **tracked()).run)
     with pytest.raises(InputError, match="found 25 images per second, and 50 frames"):
         _write_clip(with_joints, "A_1", "m_A_1", "train", tmp_path / "released", "none")
-    assert [path.name for path in write("worldpose", run, tmp_path / "slower")] == ["A_1.npz"]
+    names = [path.name for path in write("worldpose", run, tmp_path / "slower")]
+    assert names == ["A_1.npz", "A_1.json"]
     assert not (tmp_path / "slower" / "cameras").exists() and "view A_1" in caplog.text
     settings = BaselineSettings.model_validate_json(written[0].read_bytes())
     assert (settings.slahmr_max_num_tracks, settings.slahmr_chunk_frames) == (30, 100)
