@@ -265,10 +265,6 @@ class _Categories(NamedTuple):
         )
 
 
-_BALL: Final = re.compile(r"((sports?|soccer|foot|basket|hand|volley)[ _-]?)?balls?")
-"""Names of the category of balls; those of people, such as ball_carrier, have more words."""
-
-
 def _categories(path: Path, limit: int) -> _Categories:
     """Return the categories of a data set; empty without names of points.
 
@@ -281,7 +277,9 @@ def _categories(path: Path, limit: int) -> _Categories:
     of: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     balls: list[dict[str, Any]] = []
     for own, each in zip(names, given, strict=True):
-        is_ball = _BALL.fullmatch(str(each.get("name")).strip().lower())
+        # Names of people, such as ball_carrier, have more words.
+        ball = r"((sports?|soccer|foot|basket|hand|volley)[ _-]?)?balls?"
+        is_ball = re.fullmatch(ball, str(each.get("name")).strip().lower())
         (balls if is_ball else of.setdefault(own, [])).append(each)
     ids = [each.get("id", ()) for each in balls]
     nameless = of.pop((), [])
