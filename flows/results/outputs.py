@@ -110,11 +110,7 @@ def _own_entries(
         path = folder / name
         old, new = (json.loads(f.read_bytes()) if f.is_file() else {} for f in (path, draft))
         for clip in sorted(new.keys() & set(clips)):
-            # Earlier versions recorded no entries.
-            of_clip = {own for file, own in known.items() if f"/{clip}." in f"/{file}"}
-            those = of_clip or set(known.values())
-            before = owners[0] if those and those <= {*owners} else "unknown origin"
-            before = known.get(f"{name}: {clip}", before) if clip in old else owners[0]
+            before = known.get(f"{name}: {clip}", "unknown origin") if clip in old else owners[0]
             other, same = before not in owners, old.get(clip, new[clip]) == new[clip]
             if other and not same and (not overwrite or before.startswith(RELEASE)):
                 raise InputError(
