@@ -19,6 +19,7 @@ from data_contracts.keypoints import EXTRA_ARRAYS, KEYPOINT_ARRAYS, KeypointDete
 from data_contracts.triangulation import CameraChange
 from tasks.unit import UnitInputs
 from worldpose.filtering.feedback import Feedback, align_results, apply_feedback
+from worldpose.geometry.boxes import are_at_border
 from worldpose.geometry.cameras import Camera, camera_from_arrays
 from worldpose.ingest.clock import remaining_offset
 from worldpose.pitch.template import PitchTemplate
@@ -159,11 +160,11 @@ def open_detections(
     cameras: Sequence[xr.Dataset],
     frame: Integers,
     feedback: StoredFeedback,
-    correct: Callable[[Singles, slice], Singles] | None = None,
+    correct: Callable[[str, Singles, slice], Singles] | None = None,
 ) -> KeypointDetections[ClipArray]:
     """Return the detections of all cameras, read in pages; NaN beyond a camera's number of them.
 
-    `correct` returns the keypoints of rows as cameras would show them that do not change.
+    `correct` returns the points or boxes of rows as cameras would show them that do not change.
     """
     aligned, points = align_points(cameras)
     most = max(1, *(camera.sizes["detection"] for camera in cameras))
@@ -179,9 +180,9 @@ def open_detections(
                 part = array[rows]
                 page[:, camera, : part.shape[1]] = part
             page = feedback.apply(name, page, rows)
-            if correct is None or name not in ("keypoints", "extra_keypoints"):
+            if correct is None or name not in ("keypoints", "extra_keypoints", "boxes"):
                 return page
-            return correct(page, rows)
+            return correct(name, page, rows)
 
         return PagedArray(shape, read)
 
@@ -276,7 +277,7 @@ def _open_frames(
 
 def _view_corrector(
     inputs: UnitInputs, clip: str, frame: Integers, further: Sequence[CameraChange]
-) -> Callable[[Singles, slice], Singles] | None:
+) -> Callable[[str, Singles, slice], Singles] | None:
     """Return the correction of cameras whose view changes; None if all stay as they are.
 
     Clips may overlap in time: each is corrected by the changes that were found in it, and all by
@@ -288,7 +289,17 @@ def _view_corrector(
     names = tuple(inputs.sources["cameras"])
     cameras, _, _ = _load_cameras(inputs, names)
     known = {name: cameras[c] for c, name in enumerate(names)}
-    return lambda page, rows: correct_views(page, frame[rows], known, views).astype(page.dtype)
+
+    def correct(name: str, page: Singles, rows: slice) -> Singles:
+        points = page.reshape(*page.shape[:3], -1, 2)  # a box has two corners
+        moved = correct_views(points, frame[rows], known, views).reshape(page.shape)
+        if name == "boxes":
+            # A side at the image's border stays there: the border cuts off the person.
+            stays = are_at_border(page, cameras.image_size[:, None]) & np.isfinite(moved)
+            moved = np.where(stays, page, moved)
+        return moved.astype(page.dtype)
+
+    return correct
 
 
 def known_changes(inputs: UnitInputs, clip: str) -> list[CameraChange]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from data_contracts.arrays import AnyFloats, Floats
+from data_contracts.arrays import AnyFloats, Flags, Floats
 
 
 def box_areas(boxes: AnyFloats) -> Floats:
@@ -29,3 +30,11 @@ def box_iou(a: AnyFloats, b: AnyFloats) -> Floats:
     shared = np.maximum(width, 0.0) * np.maximum(height, 0.0)
     union = box_areas(a)[..., :, None] + box_areas(b)[..., None, :] - shared
     return np.asarray(np.divide(shared, union, out=np.zeros_like(shared), where=union > 0.0))
+
+
+def are_at_border(boxes: AnyFloats, image_size: NDArray[np.int64]) -> Flags:
+    """Return which sides of boxes (..., 4) [px] are at the image's border, which may cut them."""
+    # A side so near to the border, relative to the box's height, is cut by it [1].
+    margin = np.maximum(2.0, 0.03 * (boxes[..., 3] - boxes[..., 1]))[..., None]
+    low, high = boxes[..., :2] < margin, boxes[..., 2:] > image_size - 1.0 - margin
+    return np.concatenate([low, high], axis=-1)

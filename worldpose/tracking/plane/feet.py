@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import AnyFloats, Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
+from worldpose.geometry.boxes import are_at_border
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.ground_error import surface_motion
@@ -196,7 +197,8 @@ def locate_feet(
         height_std = np.where(both, foot_height_std, 1.5 * foot_height_std)
         bottom = np.stack([0.5 * (box[..., 0] + box[..., 2]), box[..., 3]], axis=-1)
         # A person who is cut by the image's border has no known middle or feet.
-        inside = _are_inside(box, camera.image_size)
+        sides = are_at_border(box, camera.image_size)
+        inside = np.asarray(~sides[..., [0, 2, 3]].any(axis=-1))  # the feet do not depend on the head
         half = 0.5 * np.array([pitch.length, pitch.width])
         on_pitch = (np.abs(place) <= half).all(axis=-1)
         is_part = _are_parts(boxes[:, c], keypoints[:, c], confidence[:, c], here, on_pitch)
@@ -225,16 +227,6 @@ def locate_feet(
     xy[~np.isfinite(calibration).all(axis=(-1, -2))] = np.nan
     kept = np.asarray(boxes, dtype=np.float64)
     return GroundPositions(xy, noise, calibration, height, is_whole, kept)
-
-
-def _are_inside(boxes: Floats, image_size: NDArray[np.int64]) -> Flags:
-    """Return whether boxes (..., 4) [px] do not reach the image's border."""
-    with np.errstate(invalid="ignore"):
-        # A box so near to the image's border, relative to its height, is cut by it [1].
-        margin = np.maximum(2.0, 0.03 * (boxes[..., 3] - boxes[..., 1]))[..., None]
-        low, high = boxes[..., :2] >= margin, boxes[..., 2:] <= image_size - 1.0 - margin
-    low[..., 1] = True  # the feet do not depend on the head
-    return np.asarray(low.all(axis=-1) & high.all(axis=-1))
 
 
 def _are_parts(
