@@ -298,7 +298,7 @@ STEPS = ("write", "check", "count")
     option("--step", choices=STEPS, help="this step alone, in this process"),
 )
 def measure_data_set(options: Namespace) -> Tables:
-    """The defaults give 2.53 million poses, the size of the paper's data set (X1, X2).
+    """The defaults give 2.53 million poses, the size of the paper's data set.
 
     People run straight on before a panning, zooming camera. Each step runs in a separate process,
     to measure its own peak.

@@ -1,4 +1,4 @@
-"""Results of stages `body_fitting` and `refitting`, named as in the WorldPose release (X3)."""
+"""Results of stages `body_fitting` and `refitting`, named as in the WorldPose release."""
 
 from __future__ import annotations
 

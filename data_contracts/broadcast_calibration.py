@@ -23,7 +23,7 @@ class KeyFrame(Record):
 
 
 class KeyFrames(Record):
-    """annotations/broadcast_calibration/<view>.json: the clicks of one broadcast view (M2)."""
+    """annotations/broadcast_calibration/<view>.json: the clicks of one broadcast view."""
 
     contract: Literal[1] = CONTRACT_VERSION
     key_frames: tuple[KeyFrame, ...] = Field(min_length=1)

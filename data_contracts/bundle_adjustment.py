@@ -1,4 +1,4 @@
-"""Result of stage `bundle_adjustment`: cameras that agree with markings and people (B1-B3)."""
+"""Result of stage `bundle_adjustment`: cameras that agree with markings and people."""
 
 from __future__ import annotations
 

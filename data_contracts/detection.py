@@ -1,4 +1,4 @@
-"""Results of `detection` (D1-D5) and `redetection` (R2): people that nets find in images."""
+"""Results of `detection` and `redetection`: people that nets find in images."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Result of stage `filtering`: detections classified by the fitted bodies (R2)."""
+"""Result of stage `filtering`: detections classified by the fitted bodies."""
 
 from __future__ import annotations
 

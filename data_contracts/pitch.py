@@ -1,4 +1,4 @@
-"""pitch.json: template, dimensions and surveyed markings of one pitch or court (C1)."""
+"""pitch.json: template, dimensions and surveyed markings of one pitch or court."""
 
 from __future__ import annotations
 

@@ -145,7 +145,7 @@ class CheckReport(Record):
 
 
 class BaselineSettings(Record):
-    """The paper's settings of the baseline methods (E6)."""
+    """The paper's settings of the baseline methods."""
 
     boxes: str = "tracks/<clip>.txt"
     """Boxes given to GLAMR and SLAHMR instead of their own detection."""
@@ -184,7 +184,7 @@ class ClipStatistics(Record):
 
 
 class DataSetStatistics(Record):
-    """Size of a data set, as the paper counts (X1, X2)."""
+    """Size of a data set, as the paper counts."""
 
     contract: Literal[1] = CONTRACT_VERSION
     clips: dict[str, ClipStatistics]

@@ -130,7 +130,7 @@ class AddedDetection(Sighting):
 
 
 class ChosenFrames(Record):
-    """Frames that a stage uses instead of its own choice (B1)."""
+    """Frames that a stage uses instead of its own choice."""
 
     kind: Literal["chosen_frames"] = "chosen_frames"
     stage: Name

@@ -1,4 +1,4 @@
-"""Results of stages `tracking` (T1, T2) and `broadcast_tracking`: who is who over time."""
+"""Results of stages `tracking` and `broadcast_tracking`: who is who over time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Results of stages `triangulation` and `retriangulation`: 3D joints with covariance (T3)."""
+"""Results of stages `triangulation` and `retriangulation`: 3D joints with covariance."""
 
 from __future__ import annotations
 

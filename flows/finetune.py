@@ -1,4 +1,4 @@
-"""Fine-tuning flow: reviewed labels in, new versions of the embedded nets out (D3-D5).
+"""Fine-tuning flow: reviewed labels in, new versions of the embedded nets out.
 
 Labels come from people: detections of chosen frames, corrected in review and exported as COCO
 keypoints. A version is adopted only if it is better on held-out frames; adopted or not, it is kept

@@ -41,22 +41,22 @@ class Gate:
     to_correct: str
     judged: Callable[[Figures], Figures] = lambda figures: figures
 
-    def objections(self, figures: Figures) -> tuple[str, ...]:
-        """Return a line for each metric beyond its limit; none if `auto` lets the result pass.
+    def objections(self, figures: Figures) -> dict[str, str]:
+        """Return metrics beyond their limits, with a line each; none if `auto` lets a result pass.
 
         A result without any metric, such as a given camera, passes: it was judged before the run. A
         metric that could not be computed is beyond every limit.
         """
         if not figures:
-            return ()
+            return {}
         judged = self.judged(figures)
-        lines = []
+        lines = {}
         for name, limit in self.limits.items():
             if name not in judged:
-                lines.append(f"{name} could not be computed")
+                lines[name] = f"{name} could not be computed"
             elif exceeds(judged[name], limit):
-                lines.append(_beyond(name, judged, limit))
-        return tuple(lines)
+                lines[name] = _beyond(name, judged, limit)
+        return lines
 
     def excess(self, figures: Figures) -> float:
         """Return the relative excess of the worst metric [1]: 0 within, 1 at twice the limit.
@@ -265,13 +265,13 @@ class Gatekeeper:
             decision = last_decision(self.match.journal.questions, name, manifest.content)
             if decision is None:
                 reasons = self._reasons(gate, manifest)
-                if reasons and self._is_known(gate, name, manifest, reasons):
+                if reasons and self._is_known(gate, name, manifest):
                     continue
                 if reasons:
                     request = request_id(name, key)
                     waiting.append(WaitingUnit(unit=name, request=request, reasons=reasons))
             elif decision.verdict == "reject":
-                said = f"{decision.who} rejected it" + (f": {decision.why}" * bool(decision.why))
+                said = f"{decision.who} rejected it" + (f": {decision.why}" if decision.why else "")
                 waiting.append(
                     WaitingUnit(unit=name, request=decision.request, reasons=(said,), rejected=True)
                 )
@@ -299,11 +299,9 @@ class Gatekeeper:
             f"camera {camera} would be left out: {reason}"
             for camera, reason in manifest.left_out.items()
         )
-        return (*asked, *left_out, *gate.objections(manifest.figures))
+        return (*asked, *left_out, *gate.objections(manifest.figures).values())
 
-    def _is_known(
-        self, gate: Gate, name: str, manifest: ResultManifest, reasons: Sequence[str]
-    ) -> bool:
+    def _is_known(self, gate: Gate, name: str, manifest: ResultManifest) -> bool:
         """Return whether people approved the same metrics of an earlier result of this unit.
 
         A metric that got no worse is the same question. Counts, whose limit is zero, can be of
@@ -324,12 +322,11 @@ class Gatekeeper:
         before = gate.judged(asked[decided[-1].request].figures)
         now = gate.judged(manifest.figures)
         return all(
-            limit > 0.0
+            gate.limits[metric] > 0.0
             and metric in before
             and metric in now
             and not exceeds(now[metric], before[metric])
-            for metric, limit in gate.limits.items()
-            if any(reason.startswith(f"{metric} ") for reason in reasons)
+            for metric in gate.objections(manifest.figures)
         )
 
     def _has_refusals(self) -> bool:

@@ -1,7 +1,7 @@
-"""Iterations of the method, each without the outliers that the previous bodies rejected (R1).
+"""Iterations of the method, each without the outliers that the previous bodies rejected.
 
 Calibrate, track, adjust, fit, calibrate the broadcast camera, filter; then repeat from tracking,
-with cameras adjusted to people (C6) and without the keypoints and boxes that no body fits (R2).
+with cameras adjusted to people and without the keypoints and boxes that no body fits.
 Every iteration is a run.
 """
 

@@ -1,7 +1,6 @@
-"""The method: its stages in the paper's order. Its review gates are in `flows.gates`.
+"""The method: its stages in the paper's order; the review gates are in `flows.gates`.
 
-See docs/explanation/architecture.md. Only the stages of this tuple exist; the comments mark the
-places of planned ones, with their units and checklist ids.
+The comments are their units; docs/explanation/architecture.md says what each does.
 """
 
 from __future__ import annotations
@@ -24,22 +23,23 @@ from flows.stages import (
 )
 
 METHOD: tuple[Stage, ...] = (
-    ingest.STAGE,  # [camera]
-    proposal.STAGE,  # [camera], without clicks  C2
-    static_calibration.STAGE,  # [camera]  C1-C5; then gate CAMERAS, C7
-    detection.STAGE,  # [camera, clip]  D1-D5; then gate PEOPLE, D6
-    filtering.REDETECTION,  # [camera, clip]  R2, from the second iteration on
-    camera_consistency.STAGE,  # [clip]  then gate CONSISTENCY
-    tracking.STAGE,  # [clip]           T1, T2; then gate IDENTITIES
-    triangulation.STAGE,  # [clip]      T3, T4; then gate JOINTS
-    bundle_adjustment.STAGE,  #         B1-B3; then gate ADJUSTMENT
-    triangulation.RETRIANGULATION,  # [clip]  B2
-    body_fitting.STAGE,  # [clip]       S1-S3; then gate ACCEPTANCE of the clip
-    broadcast_calibration.STAGE,  # [clip]  M1-M6; then gate BROADCAST
-    broadcast_calibration.POOLING,  # [clip]  M1
-    broadcast_calibration.TRACKING,  # [clip]  without static cameras
-    body_fitting.REFITTING,  # [clip]   S1, S4
-    filtering.STAGE,  # [clip]          R2; then again from tracking, R1 (flows/iterate.py)
+    ingest.STAGE,  # camera, broadcast view
+    proposal.STAGE,  # camera without clicks
+    static_calibration.STAGE,  # camera
+    detection.STAGE,  # camera and clip, broadcast view
+    filtering.REDETECTION,  # camera and clip, from the second iteration on
+    camera_consistency.STAGE,  # clip
+    tracking.STAGE,  # clip
+    triangulation.STAGE,  # clip
+    bundle_adjustment.STAGE,  # match
+    triangulation.RETRIANGULATION,  # clip
+    body_fitting.STAGE,  # clip
+    broadcast_calibration.STAGE,  # broadcast view
+    broadcast_calibration.POOLING,  # broadcast view
+    broadcast_calibration.TRACKING,  # clip without static cameras
+    body_fitting.REFITTING,  # clip
+    filtering.STAGE,  # clip; then again from tracking (flows/iterate.py)
+)
     # release, evaluation               X1-X3, E1-E6
 )
 

@@ -415,7 +415,9 @@ def _result(
         state="done",
         seconds=manifest.seconds,
         figures=manifest.figures,
-        objections=() if gate is None or is_approved else gate.objections(manifest.figures),
+        objections=()
+        if gate is None or is_approved
+        else tuple(gate.objections(manifest.figures).values()),
         bytes=sum(file.size for file in manifest.files),
     )
     if waits is None or is_approved:

@@ -197,7 +197,7 @@ def open_still(inputs: UnitInputs) -> NDArray[np.uint8] | None:
 
 
 def _filmed_still(folder: Path, filmed: Mapping[str, Any]) -> NDArray[np.uint8]:
-    """Return the median of images evenly spaced over the clips; motionless people stay in it (C4).
+    """Return the median of images evenly spaced over the clips; motionless people stay in it.
 
     Raises:
         InputError: the file differs from the registered one, or is not a video.

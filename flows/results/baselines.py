@@ -1,4 +1,4 @@
-"""Scores of baseline methods' results under the paper's protocol, and their table (E1-E5)."""
+"""Scores of baseline methods' results under the paper's protocol, and their table."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def score_methods(
     Args:
         named: NAME=PATH of each result.
         reference: ground truth, as for `worldpose evaluate`.
-        match_in: reference camera in whose image tracks are matched (E3).
+        match_in: reference camera in whose image tracks are matched.
         body: body model that poses are applied to; None = the open body.
         first_frame: match frame of the methods' first image; None = the reference's first.
         fps: frames per second; None = those that the reference states.
@@ -165,7 +165,7 @@ PER_PERSON: Final = {
     "g_mpjpe_mm": "per_person_g_mpjpe_mm",
     "per_meter_drift_cm_per_m": "per_person_drift_cm_per_m",
 }
-"""Metrics of a row with one alignment per person (E2)."""
+"""Metrics of a row with one alignment per person."""
 
 _LOCAL: Final = ("pa_mpjpe_mm", "pa_mpjpe_rigid_mm", "track_coverage", "persons", "frames")
 _ALONE: Final = (

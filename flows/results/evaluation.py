@@ -100,7 +100,7 @@ def score(
         stage: stage whose joints are scored if `prediction` is a match; None = the last one with
             joints.
         fps: frames per second; None = those that a side states.
-        match_in: reference camera in whose image tracks are matched (E3).
+        match_in: reference camera in whose image tracks are matched.
         reading: how the reference's file is read.
 
     Raises:

@@ -75,7 +75,7 @@ def export_joints(origin: best_results.Origin, out: Path) -> Iterator[Path]:
 
 
 def export_worldpose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
-    """Write `poses/<clip>.npz` and `cameras/<broadcast view or static camera>.npz` (X3).
+    """Write `poses/<clip>.npz` and `cameras/<broadcast view or static camera>.npz`.
 
     A clip without people has cameras alone. A moving camera of another frame rate than the match is
     left out. Other lenses than Brown's are fitted by it; `lens_errors.json` states the largest

@@ -1,7 +1,7 @@
 """Stages `body_fitting` and `refitting`: bodies of one clip each.
 
-`body_fitting` fits them to triangulated joints (S1-S3). `refitting` has the clips with broadcast
-detections or with players of other clips (S1, S4), and without static cameras those whose people
+`body_fitting` fits them to triangulated joints. `refitting` has the clips with broadcast
+detections or with players of other clips, and without static cameras those whose people
 are tracked and have monocular poses.
 """
 

@@ -1,7 +1,7 @@
 """Stages of broadcast cameras: one unit per broadcast view, which is a camera in one clip.
 
-`broadcast_calibration` has the views with key frames, clicked or proposed (M1-M6),
-`broadcast_pooling` those whose camera filmed other clips, too (M1), and `broadcast_tracking` the
+`broadcast_calibration` has the views with key frames, clicked or proposed,
+`broadcast_pooling` those whose camera filmed other clips, too, and `broadcast_tracking` the
 calibrated clips of a match without static cameras.
 """
 

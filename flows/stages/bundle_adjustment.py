@@ -1,4 +1,4 @@
-"""Stage `bundle_adjustment`: one unit per match, all its static cameras and clips (B1-B3)."""
+"""Stage `bundle_adjustment`: one unit per match, all its static cameras and clips."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stage `detection`: people in videos; one unit per clip and camera without 2D poses (D1-D5)."""
+"""Stage `detection`: people in videos; one unit per clip and camera without 2D poses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stages `filtering` and `redetection`: detections compared with the bodies (R2).
+"""Stages `filtering` and `redetection`: detections compared with the bodies.
 
 `filtering` has one unit per clip. `redetection` searches again, from the second iteration on, where
 the bodies of the previous one say that people are: one unit per static camera's video and clip.

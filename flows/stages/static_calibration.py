@@ -1,4 +1,4 @@
-"""Stage `static_calibration`: one unit per static camera, given, clicked or proposed (C1-C5)."""
+"""Stage `static_calibration`: one unit per static camera, given, clicked or proposed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stage `tracking`: one unit per clip, from all static cameras (T1, T2)."""
+"""Stage `tracking`: one unit per clip, from all static cameras."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def units(match: Match) -> tuple[str, ...]:
 
 
 def inputs_from_before(match: Match, unit: str) -> tuple[str, ...]:
-    """Return cameras adjusted to people (C6), and the filtering results (R2)."""
+    """Return cameras adjusted to people, and the filtering results."""
     return ("bundle_adjustment/cameras", *filtering_inputs(match, unit))
 
 

@@ -1,4 +1,4 @@
-"""Stages `triangulation` and `retriangulation`: one unit per clip, from its tracks (T3, T4, B2)."""
+"""Stages `triangulation` and `retriangulation`: one unit per clip, from its tracks."""
 
 from __future__ import annotations
 

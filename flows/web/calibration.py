@@ -1,4 +1,4 @@
-"""Clicking markings in an image: clicks, image, and the camera estimated from them (C7)."""
+"""Clicking markings in an image: clicks, image, and the camera estimated from them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Detections of a camera in one frame: review, correction, and other cameras' views (D4, D6)."""
+"""Detections of a camera in one frame: review, correction, and other cameras' views."""
 
 from __future__ import annotations
 

@@ -341,7 +341,7 @@ already removed."""
 
 
 def _add_outliers(router: APIRouter, context: PageContext) -> None:
-    """Add the route of the adjustment's outliers, each with the edit that removes it (B3)."""
+    """Add the route of the adjustment's outliers, each with the edit that removes it."""
 
     @router.get("/outliers")
     def outliers(match_id: str, request: str) -> list[dict[str, Any]]:

@@ -76,7 +76,7 @@ def test_later_iterations_are_made_from_the_one_before_and_nothing_else_is_new(c
             for each in wanted:
                 assert unit.recipe.inputs[each] == units[number - 1, each].key
         if stage == "tracking":
-            # Cameras that agree with people (C6).
+            # Cameras that agree with people.
             cameras = "bundle_adjustment/cameras"
             assert unit.recipe.inputs[cameras] == units[number - 1, cameras].key
 

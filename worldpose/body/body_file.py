@@ -187,7 +187,7 @@ def _build_model(arrays: Mapping[str, NDArray[np.generic]], name: str, path: Pat
         return BodyModel(
             name=name,
             template=arrays["v_template"].astype(np.float64),
-            # Number of betas that are read, as in the released poses (X3).
+            # Number of betas that are read, as in the released poses.
             shape_directions=arrays["shapedirs"][:, :, :10].astype(np.float64),
             pose_directions=arrays["posedirs"].astype(np.float64),
             joint_regressor=arrays["J_regressor"].astype(np.float64),

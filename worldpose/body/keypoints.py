@@ -151,7 +151,7 @@ SKELETONS: Final = MappingProxyType(
         "coco17": COCO17,
         "body25": BODY25,
         "halpe26": HALPE26,
-        # The joints that the paper scores (E4).
+        # The joints that the paper scores.
         "evaluated14": (
             "nose",
             "neck",

@@ -1,4 +1,4 @@
-"""Shape from bone lengths (S1).
+"""Shape from bone lengths.
 
 The paper adds lengths of shape directions; lengths do not add, so here a bone's length is that of
 the blended bone. Joint noise makes bones longer, by about its variance over the length; the mean
@@ -106,7 +106,7 @@ def shorten_limbs(joints: Floats, covariance: Floats) -> Floats:
 
 
 def fit_shape(model: BodyModel, bones: BoneLengths) -> Shape:
-    """Return the most probable betas for bones, with exact lengths of the blended bones (S1).
+    """Return the most probable betas for bones, with exact lengths of the blended bones.
 
         beta* = arg min sum_b (l_b - |T_b + D_b beta|)^2 / s_b^2 + |beta|^2
 
@@ -144,7 +144,7 @@ def agree(one: Shape, other: Shape) -> bool:
 
 
 def pool_shapes(shapes: Sequence[Shape], weight: float) -> Shape:
-    """Return one person's shape from several clips: information-weighted means (S1).
+    """Return one person's shape from several clips: information-weighted means.
 
     Every covariance includes the normal prior of betas, which counts once. Clips count as
     independent, although the detector's offsets are the same in all of them.

@@ -1,4 +1,4 @@
-"""Order of body fitting (S1-S4): the objective is in `residuals`.
+"""Order of body fitting: the objective is in `residuals`.
 
 1. Shapes, from bone lengths, then together with the detector's offsets and coarse poses of some
    seconds of each person (`shapes`).
@@ -53,7 +53,7 @@ def fit_bodies(
     ground: Ground | None = None,
     known_shapes: Mapping[int, Shape] | None = None,
 ) -> BodyFit:
-    """Return the bodies that fit the triangulated joints of all persons (S1-S3).
+    """Return the bodies that fit the triangulated joints of all persons.
 
     Args:
         model: the body.

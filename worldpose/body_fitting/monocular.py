@@ -1,4 +1,4 @@
-"""Monocular SMPL estimates: file formats, poses in the world, and terms in the objective (S4).
+"""Monocular SMPL estimates: file formats, poses in the world, and terms in the objective.
 
 4DHumans (HMR2) and HybrIK estimate a body in each image crop: useful joint rotations, at a guessed
 depth and size. Only the rotations and the image position are used. Every file is an npz of arrays;

@@ -2,7 +2,7 @@
 
 No view determines the distance of such a person. The feet give it, since they stand on the pitch; a
 monocular method gives the pose, turned into the world by the calibrated camera; the image's
-keypoints correct both across the line of sight. The fit is that of triangulated people (S1-S3) with
+keypoints correct both across the line of sight. The fit is that of triangulated people with
 other evidence: lines of sight, and places on the pitch with their covariance.
 """
 
@@ -114,7 +114,7 @@ def fit_bodies_on_plane(
     ground: Ground,
     settings: BodyFittingSettings = BodyFittingSettings(),  # noqa: B008
 ) -> PlaneBodies:
-    """Return the bodies of people that one camera alone sees (S1-S4 without triangulation).
+    """Return the bodies of people that one camera alone sees without triangulation.
 
     The covariance contains the distance that the feet leave open, the foot's bias over the slope of
     the line of sight, and a lean. Joints in depth are as uncertain as the monocular angles.

@@ -1,4 +1,4 @@
-"""Pose coordinates that keypoints determine: joint limits, pose prior and initial poses (S2).
+"""Pose coordinates that keypoints determine: joint limits, pose prior and initial poses.
 
 COCO's 17 points leave many of a body's 69 angles undetermined: the bend of single spine joints,
 hands and feet. 30 coordinates remain: bend of the whole spine and of the whole neck, hips, knees,
@@ -185,7 +185,7 @@ def nearest_matrices(matrices: Floats) -> Floats:
 
 
 def align_root(rest: Floats, torso: Floats) -> tuple[Floats, Floats]:
-    """Return orientation (frames, 3, 3) and position of `rest`'s mean (frames, 3) [m] (S2).
+    """Return orientation (frames, 3, 3) and position of `rest`'s mean (frames, 3) [m].
 
     Args:
         rest: (4, 3) [m], shoulders and hips of the unposed body.

@@ -1,4 +1,4 @@
-"""Poses of one person in all frames, for a known shape: Gauss-Newton on the objective (S3)."""
+"""Poses of one person in all frames, for a known shape: Gauss-Newton on the objective."""
 
 from __future__ import annotations
 

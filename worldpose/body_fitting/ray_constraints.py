@@ -1,4 +1,4 @@
-"""Ray constraints: lines of sight of joints that one camera alone sees (S4).
+"""Ray constraints: lines of sight of joints that one camera alone sees.
 
 All lines of a person in a frame count as parallel. Otherwise the image size would determine the
 person's distance, and a hundredth of it, less than any detector's bias, is 0.7 m at 70 m. Motion

@@ -1,4 +1,4 @@
-"""The objective of body fitting, and its terms with their derivatives (S3).
+"""The objective of body fitting, and its terms with their derivatives.
 
 For one person, with pose theta, position t, shape beta, the detector's offsets o, keypoints
 P_tj(theta, t, beta) of the body, and second differences D_tj = P_t+2,j - 2 P_t+1,j + P_tj:

@@ -54,7 +54,7 @@ class ClipEvidence:
         ray_constraints: lines of sight of joints that are not triangulated, for the same frames and
             persons; a person without joints is present as long as these last.
         monocular_poses: poses of the same frames and persons, used where few joints are well
-            determined (S4).
+            determined.
         shared_covariance: (frames, persons, 3, 3) [m^2], the part of `covariance` that moves all
             joints of a person together: no number of joints reduces it. NaN = unknown in this
             frame; None = none.

@@ -1,4 +1,4 @@
-"""Shapes of all persons with the detector's offsets, which many frames share (S1).
+"""Shapes of all persons with the detector's offsets, which many frames share.
 
 Each can compensate for the other: taller people, or a detector that sees all ankles too high. So no
 term may push along that direction frame by frame, because such terms add up while the two priors do

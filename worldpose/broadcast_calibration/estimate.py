@@ -1,4 +1,4 @@
-"""Calibration of every frame of a broadcast clip from a few key frames (M1 to M6)."""
+"""Calibration of every frame of a broadcast clip from a few key frames."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def calibrate_broadcast(
         DegenerateError: the evidence does not determine the camera of every frame.
 
     Note:
-        M1 to M6; paper section "Broadcasting Camera Calibration" and its supplement.
+        Paper section "Broadcasting Camera Calibration" and its supplement.
     """
     return refine(pitch, clip, track(pitch, clip, settings), settings)
 
@@ -128,7 +128,7 @@ def calibrate_broadcast(
 def track(
     pitch: PitchTemplate, clip: BroadcastClip, settings: BroadcastCalibrationSettings
 ) -> TrackedClip:
-    """Return cameras from key frames and followed points (M2); see `calibrate_broadcast`."""
+    """Return cameras from key frames and followed points; see `calibrate_broadcast`."""
     key_frames, where, first = clip.key_frames, clip.where, clip.first
     wanted = {key.frame - first for key in key_frames}
     if len(wanted) < len(key_frames):
@@ -170,7 +170,7 @@ def refine(
     tracked: TrackedClip,
     settings: BroadcastCalibrationSettings,
 ) -> BroadcastCalibration:
-    """Return the joint fit of all frames (M3 to M6); see `calibrate_broadcast`."""
+    """Return the joint fit of all frames; see `calibrate_broadcast`."""
     people, boxes, fps = clip.people, clip.moving_boxes, clip.fps
     learned = LearnedNoise(PitchErrors.of(pitch, settings))
     first_errors = learned.errors

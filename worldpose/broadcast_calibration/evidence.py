@@ -150,7 +150,7 @@ class PointEvidence:
 
 @dataclass(frozen=True, eq=False)
 class FlowEvidence:
-    """Static points, followed from one frame to the next (M6).
+    """Static points, followed from one frame to the next.
 
     Attributes:
         frame: (n,) index of the first frame, rising.

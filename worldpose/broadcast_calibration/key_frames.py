@@ -1,4 +1,4 @@
-"""Calibration of key frames: each alone, then all with one center and principal point (M1, M2)."""
+"""Calibration of key frames: each alone, then all with one center and principal point."""
 
 from __future__ import annotations
 

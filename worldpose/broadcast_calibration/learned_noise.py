@@ -1,4 +1,4 @@
-"""Noise and weights that a clip's own tracking and residuals show (M6)."""
+"""Noise and weights that a clip's own tracking and residuals show."""
 
 from __future__ import annotations
 

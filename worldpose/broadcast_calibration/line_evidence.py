@@ -1,4 +1,4 @@
-"""Detection of painted lines in every frame, across the template's projection (M2, M3)."""
+"""Detection of painted lines in every frame, across the template's projection."""
 
 from __future__ import annotations
 

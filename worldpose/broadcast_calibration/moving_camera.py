@@ -1,4 +1,4 @@
-"""Moving camera: one center and principal point, with a rotation and a lens per frame (M1)."""
+"""Moving camera: one center and principal point, with a rotation and a lens per frame."""
 
 from __future__ import annotations
 

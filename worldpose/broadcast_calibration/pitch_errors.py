@@ -1,4 +1,4 @@
-"""Errors of a pitch template: its survey or paint, and an unmeasured size and crown (M3).
+"""Errors of a pitch template: its survey or paint, and an unmeasured size and crown.
 
 A pitch without a survey has its markings where the Laws of the Game put them, within the accuracy
 of the painter, on a surface whose crown is a matter of local practice. The fit of a clip estimates

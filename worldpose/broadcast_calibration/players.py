@@ -1,4 +1,4 @@
-"""Matches of players of the static cameras with detections in the broadcast frames (M4)."""
+"""Matches of players of the static cameras with detections in the broadcast frames."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def boxes_of(keypoints: Floats) -> Floats:
 
 
 def similarity(projected: Floats, detected: Floats) -> Floats:
-    """Return the similarity of projected and detected people (persons, detections) [-1..1] (M4).
+    """Return the similarity of projected and detected people (persons, detections) [-1..1].
 
         sim(p_i, p_j) = IoU(box of p_i, box of p_j) (1 / K) sum_k cos(p_i,k, p_j,k)
 

@@ -1,4 +1,4 @@
-"""Priors of a clip's cameras (M3)."""
+"""Priors of a clip's cameras."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Objective of the moving camera's fit, and its terms (M3, M4, M6).
+"""Objective of the moving camera's fit, and its terms.
 
 For the camera L_t of every frame t of a clip, all with one center and principal point:
 

@@ -81,9 +81,9 @@ class BroadcastCalibrationSettings(Record):
     """Standard deviation of an unmeasured length or width from 105 and 68 m [m]: prior. Top
     competitions prescribe this size; 0 = as given. A pitch of another size needs pitch.json."""
     field_weight: float = Field(default=1.0, ge=1e-6, le=100)
-    """Factor on the loss of markings (M3; the paper's 1)."""
+    """Factor on the loss of markings (the paper's 1)."""
     player_weight: float = Field(default=0.5, ge=0, le=100)
-    """Factor on the loss of players' keypoints (M4; the paper's 0.5): with residuals in standard
+    """Factor on the loss of players' keypoints (the paper's 0.5): with residuals in standard
     deviations, two keypoints of a person are worth one; a detector's errors are correlated."""
     loss_scale: float = Field(default=3.0, ge=1e-6, le=1000)
     """Scale of the Geman-McClure losses [standard deviations]; the paper gives none."""
@@ -107,14 +107,14 @@ class BroadcastCalibrationSettings(Record):
     """Minimum standard deviation of a followed point's motion [px]; a larger value measured in the
     clip replaces it."""
     flow_outlier: float = Field(default=3.5, ge=1e-6, le=1000)
-    """Maximum modified z-score of a followed point (M6; threshold of Iglewicz and Hoaglin)."""
+    """Maximum modified z-score of a followed point (threshold of Iglewicz and Hoaglin)."""
     flow_weight: float = Field(default=1.0, ge=0, le=100)
-    """Factor on the loss of followed points (M6); 0 = without."""
+    """Factor on the loss of followed points; 0 = without."""
     flow_drift_px: float = Field(default=0.15, ge=1e-6, le=100)
     """Drift of tracking after one frame, growing with the square root of the frames [px]; the drift
     measured between two or more key frames replaces it."""
     smooth: bool = True
-    """Smooth focal length and distortion as much as the clip's own tracking supports (M6)."""
+    """Smooth focal length and distortion as much as the clip's own tracking supports."""
     feed_offset: Literal["report", "correct"] = "report"
     """Handling of the feed's clock offset from the static cameras: report it, or shift people in
     time by it if it is determined."""
@@ -124,7 +124,7 @@ class BroadcastCalibrationSettings(Record):
     """Maximum solver iterations in each of these passes [1]."""
     method: Literal["worldpose", "paper"] = "worldpose"
     """Method of the last fit; `paper` minimizes E_field and E_player alone by Adam, from the
-    tracked camera (M5; needs the extra `body`)."""
+    tracked camera (needs the extra `body`)."""
     adam_iterations: int = Field(default=2000, ge=1, le=1_000_000)
     """Iterations of Adam, if `method` is `paper` [1]."""
     cut_share: float = Field(default=0.25, gt=0, lt=1)

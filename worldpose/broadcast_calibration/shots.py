@@ -1,4 +1,4 @@
-"""Segmentation of a programme into shots, and selection of main-camera clips (paper, rule X1)."""
+"""Segmentation of a programme into shots, and selection of main-camera clips (paper)."""
 
 from __future__ import annotations
 

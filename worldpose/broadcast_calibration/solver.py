@@ -1,4 +1,4 @@
-"""Joint fit of all frames: Levenberg-Marquardt on an arrow system, or the paper's Adam (M5)."""
+"""Joint fit of all frames: Levenberg-Marquardt on an arrow system, or the paper's Adam."""
 
 from __future__ import annotations
 

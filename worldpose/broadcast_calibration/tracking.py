@@ -1,4 +1,4 @@
-"""Tracking: followed points, the rotation between two frames, cameras of all frames (M2, M6)."""
+"""Tracking: followed points, the rotation between two frames, cameras of all frames."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ def flow_errors(both: MovingCamera, followed: Followed) -> Floats:
 
 
 def modified_z_scores(residual: Floats) -> Floats:
-    """Return each point's modified z-score (n,), the larger of both axes (M6).
+    """Return each point's modified z-score (n,), the larger of both axes.
 
     The score is 0.6745 times the distance of the residual (n, 2) [px] from the median, divided by
     the median of these distances (Iglewicz and Hoaglin, 1993). It is NaN where the residual is

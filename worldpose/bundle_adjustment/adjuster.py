@@ -1,4 +1,4 @@
-"""Adjustment of a clip's cameras to all people or without a group, and held-out validation (B2)."""
+"""Adjustment of a clip's cameras to all people or without a group, and held-out validation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Input of bundle adjustment: a clip's most informative frames (B1) and their keypoints."""
+"""Input of bundle adjustment: a clip's most informative frames and their keypoints."""
 
 from __future__ import annotations
 
@@ -259,7 +259,7 @@ def propose_frames(
     min_views: int,
     taken: Integers | None = None,
 ) -> Integers:
-    """Return indices of the most informative frames for all cameras, ascending (B1).
+    """Return indices of the most informative frames for all cameras, ascending.
 
     Each frame adds keypoints of joints with enough views to cells of the pitch, per camera; further
     keypoints of a cell have diminishing value (the sum of logarithms). A greedy search takes the

@@ -1,4 +1,4 @@
-"""Adjustment of cameras to people and markings, with acceptance per camera (B1-B3)."""
+"""Adjustment of cameras to people and markings, with acceptance per camera."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def adjust_cameras(
         settings: evidence, weights, acceptance.
 
     Note:
-        B1-B3; paper section "Bundle Adjustment".
+        Paper section "Bundle Adjustment".
     """
     other = "refused: this camera shows other people than the other cameras under the same ids"
     proposed = propose_frames(

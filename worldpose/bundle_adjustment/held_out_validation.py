@@ -1,4 +1,4 @@
-"""Held-out validation (B3): people outside the adjustment validate every camera's change."""
+"""Held-out validation: people outside the adjustment validate every camera's change."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Objective of bundle adjustment, its terms and their weights (B2).
+"""Objective of bundle adjustment, its terms and their weights.
 
 For cameras L_c, joints X_j of people and detections x_jc of the joints that camera c shows:
 

@@ -1,4 +1,4 @@
-"""Bundle adjustment solver (B2): Levenberg-Marquardt on the reduced camera system."""
+"""Bundle adjustment solver: Levenberg-Marquardt on the reduced camera system."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scores of methods' folders against the clips of a data set, by the paper's protocol (E1-E4)."""
+"""Scores of methods' folders against the clips of a data set, by the paper's protocol."""
 
 from __future__ import annotations
 

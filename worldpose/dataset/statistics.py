@@ -1,4 +1,4 @@
-"""Statistics of a data set: clips, frames, poses, distances (X1, X2)."""
+"""Statistics of a data set: clips, frames, poses, distances."""
 
 from __future__ import annotations
 

@@ -155,7 +155,7 @@ class _BoxTrack:
 
 
 class BoxCleaner:
-    """Cleans detections frame by frame, in bounded memory (D3)."""
+    """Cleans detections frame by frame, in bounded memory."""
 
     def __init__(self, settings: DetectionSettings) -> None:
         self._settings = settings

@@ -1,4 +1,4 @@
-"""People in one camera's video: boxes, then keypoints, in chunks of frames (D1-D5)."""
+"""People in one camera's video: boxes, then keypoints, in chunks of frames."""
 
 from __future__ import annotations
 

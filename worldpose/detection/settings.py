@@ -20,7 +20,7 @@ ClassNumber = Annotated[int, Field(ge=0, le=10_000)]
 
 
 class DetectionSettings(Record):
-    """Settings of `detection` (paper: refinement of 2D detection results; D1-D5)."""
+    """Settings of `detection` (paper: refinement of 2D detection results)."""
 
     detector: Annotated[tuple[str, ...], BeforeValidator(_one_or_more)] = Field(
         default=("embedded",), min_length=1
@@ -72,7 +72,7 @@ class DetectionSettings(Record):
     """A track with fewer sightings, where as many frames were searched, is a flicker [1]. Frames
     are buffered until a track can have as many: `stride` times `min_hits` - 1 images in memory."""
     pitch_margin_m: float = Field(default=2.5, ge=0, le=1000)
-    """People whose feet are farther outside of the pitch than this are crowd (D2) [m]. Throw-ins,
+    """People whose feet are farther outside of the pitch than this are crowd [m]. Throw-ins,
     sprints over the line and assistants, 1.5 m out, stay: the position of a far foot is accurate to
     1 m. People waiting behind the lines stand from 2.5 m on, boards 3 to 6 m out."""
     find_occluded: bool = False

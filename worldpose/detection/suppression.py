@@ -66,7 +66,7 @@ def fuse(members: list[People], overlap: float) -> People:
         overlap: boxes with a larger intersection over union are of one person [1].
 
     Note:
-        D3. Solovyev et al., Weighted boxes fusion, 2021.
+        Solovyev et al., Weighted boxes fusion, 2021.
     """
     each = [suppress(member, overlap) for member in members]
     if len(each) == 1:

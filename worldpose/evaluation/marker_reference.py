@@ -1,4 +1,4 @@
-"""Alignment of a marker-based reference to a prediction in time and space (X1)."""
+"""Alignment of a marker-based reference to a prediction in time and space."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ class EvaluationSettings(Record):
     the border of all images is no false negative."""
     min_overlap: float = Field(default=0.5, ge=1e-6, le=1)
     """Minimum intersection over union of matched boxes [1]; the usual value, since the paper gives
-    none (E3)."""
+    none."""
     min_aligned_joints: int = Field(default=7, ge=3, le=1000)
     """Minimum joints, of 14, of a person in a frame for PA-MPJPE [1]: alignment to a few joints
     removes most of their error, and half a body hides the error of the other half."""
@@ -225,7 +225,7 @@ def match_boxes(overlap: Floats, least: float) -> Integers:
     """Return the predicted person matched to each true one (frames, true), -1 for none.
 
     One-to-one and greedy per frame, by falling overlap (frames, true persons, predicted persons)
-    [1], down to the least (E3).
+    [1], down to the least.
     """
     frames, true, predicted = overlap.shape
     match = np.full((frames, true), -1, dtype=np.int64)
@@ -249,9 +249,6 @@ def merge_tracks(pairs: Integers, cost: Floats) -> Integers:
 
     `pairs` (frames, true persons) are matches per frame, -1 for none; `cost` (frames, true,
     predicted persons) is infinite where either does not exist.
-
-    Note:
-        E3.
     """
     _, true, predicted = cost.shape
     if not predicted:
@@ -372,7 +369,7 @@ def match_tracks(
     boxes: Floats | None,
     settings: EvaluationSettings,
 ) -> Integers:
-    """Return the predicted person of each true one (frames, true), by whole tracks (E3).
+    """Return the predicted person of each true one (frames, true), by whole tracks.
 
     `people` and `true` are (frames, persons, 17, 3) [m], NaN where missing, `distances` (frames,
     true, predicted persons) [m], `match` (frames, true persons) the matches by these. With a

@@ -73,7 +73,7 @@ def correct_limbs(predicted: Floats, true: Floats, alpha: float) -> Flags:
 
 
 def paper_joints(joints: Floats) -> Floats:
-    """Return the joints of E4 (..., 14, 3) [m] from COCO-17 (..., 17, 3), NaN where missing."""
+    """Return the paper's joints (..., 14, 3) [m] from COCO-17 (..., 17, 3), NaN where missing."""
     neck = joints[..., 5:7, :].mean(axis=-2, keepdims=True)
     return np.concatenate([joints[..., :1, :], neck, joints[..., 5:, :]], axis=-2)
 
@@ -92,15 +92,15 @@ def mid_hip(joints: Floats) -> Floats:
 class AlignedErrors:
     """Joint distances after alignment; NaN where a joint is missing on either side.
 
-    Distances are (frames, persons, 14) [m], on the joints of E4.
+    Distances are (frames, persons, 14) [m], on `paper_joints`.
     """
 
     shared: Floats
-    """One alignment for all people's whole trajectories (E1)."""
+    """One alignment for all people's whole trajectories."""
     per_person: Floats
-    """One alignment for each person's whole trajectory (E2)."""
+    """One alignment for each person's whole trajectory."""
     per_frame: Floats
-    """One alignment for each person in each frame (E1)."""
+    """One alignment for each person in each frame."""
     scale: float
     """Scale of the shared alignment: true over predicted size; 1 if rigid, NaN without common
     joints."""
@@ -161,7 +161,7 @@ def drift_per_meter(errors: Floats, lengths: Floats, min_length: float) -> float
     Errors are (frames, persons, joints) [m], NaN where missing; path lengths (persons,) [m].
 
     Note:
-        E1. The ratio of the published columns does not give the published drift, so that the drift
+        The ratio of the published columns does not give the published drift, so that the drift
         is no ratio of means over all people; this function averages the ratio of each trajectory.
     """
     known = np.isfinite(errors)
@@ -187,7 +187,7 @@ def challenge_errors(predicted: Floats, true: Floats) -> tuple[Floats, Floats]:
 def acceleration_errors(predicted: Floats, true: Floats, frames: Integers, fps: float) -> Floats:
     """Return errors of joint acceleration (frames - 2, persons, 14) [m/s^2], NaN where unknown.
 
-    Second differences of three successive frames at the minimum step, on the joints of E4. Joints
+    Second differences of three successive frames at the minimum step, on `paper_joints`. Joints
     are (frames, persons, 17, 3) [m] as in `challenge_errors`; match frames (frames,) rise.
     """
     offset = paper_joints(predicted) - paper_joints(true)
@@ -236,7 +236,7 @@ def pool_people(
     """Return the scores of whole tracks over the people of several clips.
 
     Every joint counts once in the errors, every trajectory in the drift. Each clip has its own
-    shared alignment (E1). A score is None if nobody has it.
+    shared alignment. A score is None if nobody has it.
     """
     least = (settings or EvaluationSettings()).min_trajectory_m
     rows = [one.model_dump() for one in people]
@@ -275,7 +275,7 @@ def evaluate_joints(
 
     Frames are paired by number: people are missing in reference frames that the prediction lacks,
     and the function ignores predicted frames that the reference lacks. `match_people` pairs people
-    per frame, without their ids; `merge_tracks` pairs trajectories (E3).
+    per frame, without their ids; `merge_tracks` pairs trajectories.
 
     Args:
         prediction: estimated joints.

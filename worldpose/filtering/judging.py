@@ -1,4 +1,4 @@
-"""Comparison of detections with bodies (R2): matches, their spread, and contradictions."""
+"""Comparison of detections with bodies: matches, their spread, and contradictions."""
 
 from __future__ import annotations
 
@@ -306,7 +306,7 @@ def judge_detections(
     until it fits one. A detection of no tracked person is judged only if it fits a body.
 
     Note:
-        Paper, supplement, "SMPL Fitting", last paragraph; its similarity of bones (M4).
+        Paper, supplement, "SMPL Fitting", last paragraph; its similarity of bones.
     """
     shape = suspects.detections.confidence.shape
     fits = np.full(shape[:3], -1, dtype=np.int16)

@@ -1,4 +1,4 @@
-"""Redetection of people at the predicted projections of their bodies (R2).
+"""Redetection of people at the predicted projections of their bodies.
 
 Input: bodies of the previous iteration in one camera's frames, its detections, a pose estimator.
 Output: the people searched for, the estimator's results, and the accepted ones.

@@ -164,7 +164,7 @@ def _read_capture(path: Path, content: bytes, number: int, fps: float) -> Camera
     packets = [(time, data[-_LENGTH:]) for time, data in found if _is_freed(data[-_LENGTH:])]
     if not packets:
         todo = "Capture the port of the tracking system: tcpdump -w FILE udp port NUMBER."
-        raise _wrong(str(path), "FreeD packets (D1)", f"none in {len(found)} frames", todo)
+        raise _wrong(str(path), "FreeD packets", f"none in {len(found)} frames", todo)
     data = _read_freed(path, b"".join(packet for _, packet in packets), number)
     times = np.array([time for time, packet in packets if number in (-1, packet[1])])
     frame, rows = _at_frames(times, fps)

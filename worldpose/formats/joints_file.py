@@ -1,4 +1,4 @@
-"""npz file formats of joints of people over time, and of body poses as in the release (X3)."""
+"""npz file formats of joints of people over time, and of body poses as in the release."""
 
 from __future__ import annotations
 

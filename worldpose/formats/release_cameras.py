@@ -36,7 +36,7 @@ def write_static_camera(path: Path, calibration: CameraCalibration) -> None:
     [m] of x_cam = R x_world + t.
 
     Note:
-        X3: the names and shapes are those of the released files, which have one row per frame.
+        The names and shapes are those of the released files, which have one row per frame.
     """
     (fx, fy), (cx, cy) = calibration.focal_px, calibration.principal_point_px
     arrays = {

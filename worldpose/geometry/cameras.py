@@ -59,9 +59,6 @@ class Camera:
 
     Raises:
         InputError: a field has the wrong shape, or the batches do not broadcast.
-
-    Note:
-        C3, C5.
     """
 
     focal: Floats

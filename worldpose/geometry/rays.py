@@ -83,7 +83,7 @@ def intersect_rays(rays: Rays, weights: ArrayLike | None = None) -> tuple[Floats
         InputError: a weight is negative.
 
     Note:
-        T3. Parallel means an angle below about 2e-6 rad, where rounding moves the point by more
+        Parallel means an angle below about 2e-6 rad, where rounding moves the point by more
         than a millimetre at 100 m.
     """
     weight = np.ones(rays.status.shape) if weights is None else np.asarray(weights, dtype=float)

@@ -306,7 +306,7 @@ def align(
         InputError: the last dimensions are not (n, 3).
 
     Note:
-        Umeyama, IEEE PAMI 13(4), 1991; E1.
+        Umeyama, IEEE PAMI 13(4), 1991.
     """
     a, b = np.broadcast_arrays(
         check_shape("align: source", source, (-1, 3)), check_shape("align: target", target, (-1, 3))

@@ -262,7 +262,7 @@ class SurveyFit:
 
 
 def fit_survey(survey: Survey, settings: SurveySettings | None = None) -> SurveyFit:
-    """Fit the pitch to a survey in any frame with heights upwards, and move it to the world (C1).
+    """Fit the pitch to a survey in any frame with heights upwards, and move it to the world.
 
     The names determine the orientation: left and right, near and far are those of a person at the
     main camera, which stands at negative y. The frame is rotated, shifted and levelled, and scaled

@@ -37,7 +37,7 @@ class PitchTemplate:
     """One pitch in the world frame: the markings of its game, surveyed points, a crown.
 
     Note:
-        C1. The surface falls from the origin by one parabola across and another along, so that
+        The surface falls from the origin by one parabola across and another along, so that
         heights are negative elsewhere; the paper states the crown's size, about 0.2 m, and not its
         profile. Pitches of real cameras also fall towards their goal lines.
     """
@@ -457,7 +457,7 @@ def _measured(spec: PitchSpec) -> set[str]:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Crown and end fall of a pitch, with what is known about them (C1).
+    """Crown and end fall of a pitch, with what is known about them.
 
     The Laws say nothing about slopes. Builders let a pitch fall by 0.5 to 1 % from the center spot,
     to the touch lines or to all sides, so that it drains. Where a survey has heights, they tell the

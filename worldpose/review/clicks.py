@@ -1,4 +1,4 @@
-"""Replay of corrections over the clicks of a match folder (B3, C7)."""
+"""Replay of corrections over the clicks of a match folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Replay of corrections over the keypoints and boxes of a detector (B3, D6)."""
+"""Replay of corrections over the keypoints and boxes of a detector."""
 
 from __future__ import annotations
 

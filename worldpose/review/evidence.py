@@ -1,8 +1,8 @@
 """Evidence for a reviewer: open detections, metrics per frame, other views, calibration preview.
 
-Other views check a correction in one image against all (D4, D6): the epipolar curve contains the
+Other views check a correction in one image against all: the epipolar curve contains the
 possible pixels of a keypoint in another camera, the prediction is its pixel if the other keypoints
-are correct. The preview shows the pitch as clicks calibrate it, and proposes next clicks (C7).
+are correct. The preview shows the pitch as clicks calibrate it, and proposes next clicks.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Replay of identity corrections over the tracker's result (T2, D6)."""
+"""Replay of identity corrections over the tracker's result."""
 
 from __future__ import annotations
 

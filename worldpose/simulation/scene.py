@@ -34,7 +34,7 @@ def place_camera(
     It has its seat's place, aim and focal length with small random offsets; without a seat, it is
     in a ring around the target beyond the pitch border. It has a roll of a fraction of a degree, a
     principal point a few pixels off the centre and the mild barrel distortion (k1, k2) of a stadium
-    lens (C5).
+    lens.
 
     `target` (3,) [m], world, is the aim of the ring.
     """
@@ -99,7 +99,7 @@ def move_broadcast_camera(
     image_size: tuple[int, int],
     rng: np.random.Generator,
 ) -> Camera:
-    """Return the broadcast camera of every frame, a batch (frames,), with one center (M1).
+    """Return the broadcast camera of every frame, a batch (frames,), with one center.
 
     Pan and tilt follow a smoothed action through two equal first-order lags, like a damped head;
     the zoom varies between wide and close. Radial distortion grows with the focal length, as in the

@@ -143,7 +143,7 @@ class RigSettings(Record):
     seat_std_m: float = Field(default=0.5, ge=0, le=100)
     """Variation of seats and aims between seeds, along each axis [m]."""
     image_size_px: tuple[ImageLength, ImageLength] = (1920, 1080)
-    """Width and height [px] (C8)."""
+    """Width and height [px]."""
     distance_m: Range = (6.0, 30.0)
     """Distance of the ring from the pitch border [m]: stands of a stadium."""
     height_m: Range = (10.0, 20.0)

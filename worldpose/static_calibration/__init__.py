@@ -1,4 +1,4 @@
-"""Static calibration: a camera from the pitch markings in its image (C1-C5).
+"""Static calibration: a camera from the pitch markings in its image.
 
 Input: a pitch template, clicked points and drawn markings, or an image alone. Output: a camera and
 its covariance.

@@ -1,4 +1,4 @@
-"""Second-order camera and covariance along ill-conditioned directions (C4).
+"""Second-order camera and covariance along ill-conditioned directions.
 
 With a long lens and clicks close together, focal length and distance trade off along a curve that
 departs from its tangent at the best camera: cameras on the curve fit nearly as well, but a

@@ -1,4 +1,4 @@
-"""Calibration of one static camera from clicks in its image (C1-C5)."""
+"""Calibration of one static camera from clicks in its image."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def calibrate_camera(
             which clicks to add.
 
     Note:
-        C1-C5; paper section "Static Camera Calibration".
+        Paper section "Static Camera Calibration".
     """
     stated = settings or StaticCalibrationSettings()
     own = {} if lens is None else {"distortion": "k1_k2_k3"}

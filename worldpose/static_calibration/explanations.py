@@ -1,4 +1,4 @@
-"""Explanations of clicks that contradict each other: wrong names, a crop, another pitch (C3)."""
+"""Explanations of clicks that contradict each other: wrong names, a crop, another pitch."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def _alternatives(
 
 
 def try_k3(found: Explanation) -> Explanation:
-    """Return the explanation with k3 if it lowers the held-out error, and the decisions (C5)."""
+    """Return the explanation with k3 if it lowers the held-out error, and the decisions."""
     min_residuals = 24  # twice the parameters
     problem, fit, settings = found.problem, found.fit, found.settings
     before = held_out_error(problem, fit)

@@ -1,4 +1,4 @@
-"""Fit of static cameras to clicks, drawn markings and priors (C3)."""
+"""Fit of static cameras to clicks, drawn markings and priors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Initial cameras from homographies, and from a grid of plausible places in the stands (C2).
+"""Initial cameras from homographies, and from a grid of plausible places in the stands.
 
 Homographies between pitch plane and image come from the normalized DLT.
 """
@@ -76,7 +76,7 @@ def camera_from_homography(
     seen: Floats,
     focal_range: tuple[float, float],
 ) -> Camera | None:
-    """Return the camera of a homography (3, 3) from the plane z = 0, or None (C2).
+    """Return the camera of a homography (3, 3) from the plane z = 0, or None.
 
     Decomposes H ~ K [r1 r2 t], the inverse of the paper's H, with r1, r2 the columns of R.
 

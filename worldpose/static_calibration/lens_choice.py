@@ -1,4 +1,4 @@
-"""Choice of a camera's lens model by its residuals, and the test that a model fits (C5)."""
+"""Choice of a camera's lens model by its residuals, and the test that a model fits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Detection of painted lines in an image, and their subpixel centers (C4).
+"""Detection of painted lines in an image, and their subpixel centers.
 
 A painted line has two edges, and an edge detector finds either: half a width off the template's
 line. This module samples brightness across the projected line, where paint is a bar of the

@@ -1,4 +1,4 @@
-"""Stage 3: refinement of a camera on the painted lines of its image (C4).
+"""Stage 3: refinement of a camera on the painted lines of its image.
 
 The paper looks up samples of the markings in a map of the distance to the nearest edge pixel. This
 module searches each sample across its own projected line, which gives a signed offset, separates

@@ -1,4 +1,4 @@
-"""Coarse-to-fine search for painted lines, samples of small uncertainty first (C4).
+"""Coarse-to-fine search for painted lines, samples of small uncertainty first.
 
 `LineSearch` alternates between measuring bars across projected markings and a robust least-squares
 fit of the camera to them, with a prior. `Bars` are the result: measured bars of painted lines, and

@@ -1,4 +1,4 @@
-"""Objective of a static camera's fit to clicks, and its terms, compiled (C3).
+"""Objective of a static camera's fit to clicks, and its terms, compiled.
 
 With clicked points x_i of places X_i on the pitch, pixels x_d drawn along markings M_d, and the
 projection Pi of camera L:

@@ -72,7 +72,7 @@ class CameraPrior(Record):
     """The same for k3 if it is free [1]."""
     lens_std: tuple[_AddedSpread, _AddedSpread, _AddedSpread] = (0.1, 0.02, 0.01)
     """Standard deviations of the coefficients k1, k2, k3 [1], added in squares to the spread from
-    the corner's displacement: wide lenses bend their corners more (C5); zero adds nothing."""
+    the corner's displacement: wide lenses bend their corners more; zero adds nothing."""
     height_m: float = Field(default=18.0, ge=1e-6, le=10000)
     """Height above the pitch [m]: stands and roofs are 8 to 40 m up."""
     log_height_std: float = Field(default=0.4, ge=1e-6, le=100)
@@ -118,7 +118,7 @@ class StaticCalibrationSettings(Record):
     """Gaussian prior of the camera."""
     click_noise_px: float = Field(default=1.0, ge=1e-6, le=100)
     """Standard deviation of a clicked point, each axis [px]: a careful click in a zoomed view
-    (C7)."""
+   ."""
     survey_error_m: float = Field(default=SURVEY_ERROR, ge=0, le=1)
     """Standard deviation of the template's points from the painted ones, each axis [m], in clicks
     and in painted lines: a total station measures to millimetres, but paint varies by a twentieth
@@ -147,7 +147,7 @@ class StaticCalibrationSettings(Record):
     """Maximum share of outliers among clicks, and among markings [1]; with more, the inliers are no
     reliable majority."""
     distortion: Literal["none", "k1", "k1_k2", "k1_k2_k3"] = "k1_k2"
-    """Free radial coefficients (C5)."""
+    """Free radial coefficients."""
     k3_gain: float = Field(default=0.1, ge=1e-6, le=10)
     """Minimum relative reduction of the held-out error to keep k3 [1]."""
     search_cameras: int = Field(default=24, ge=1, le=10000)
@@ -161,6 +161,6 @@ class StaticCalibrationSettings(Record):
     map_step_m: float = Field(default=2.0, ge=1e-6, le=1000)
     """Grid spacing of the expected ground error's map [m]."""
     lines: bool = True
-    """Refine on the painted lines if there is an image (C4)."""
+    """Refine on the painted lines if there is an image."""
     line_refinement: LineRefinementSettings = LineRefinementSettings()
     """Settings of the refinement on painted lines."""

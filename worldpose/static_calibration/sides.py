@@ -1,4 +1,4 @@
-"""Sides of the pitch on which cameras stand, decided by people in view of several cameras (C2).
+"""Sides of the pitch on which cameras stand, decided by people in view of several cameras.
 
 The pitch looks the same after half a turn, so that the paint in one image does not tell from which
 side it was taken. People do: under the right choice, feet in two images meet on the ground. One

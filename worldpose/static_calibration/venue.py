@@ -1,4 +1,4 @@
-"""Joint estimate by static cameras of the pitch of a venue (C1, C4).
+"""Joint estimate by static cameras of the pitch of a venue.
 
 Paint lies where it lies for every camera: the surface of the pitch, the errors of a survey, and
 uneven ground and paint. Each camera alone cannot tell these from its own position and lens; two

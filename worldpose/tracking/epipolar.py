@@ -1,4 +1,4 @@
-"""Association of detections across views without history, by distance between rays (T2)."""
+"""Association of detections across views without history, by distance between rays."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def associate(
             `epipolar_gate_m`.
 
     Note:
-        T2. Each detection joins one group at most.
+        Each detection joins one group at most.
     """
     cameras = len(centers)
     needed = settings.birth_views

@@ -1,4 +1,4 @@
-"""Frame-by-frame tracking: matching, births, losses, merges (T1, T2)."""
+"""Frame-by-frame tracking: matching, births, losses, merges."""
 
 from __future__ import annotations
 

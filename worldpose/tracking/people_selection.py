@@ -4,7 +4,7 @@ A track ends after a moment unseen, so one person usually has several. A fragmen
 look like a bystander, while fetching the ball, or like a shadow, if few cameras see the player in a
 duel; the player's other tracks show neither.
 
-Bystanders are never on the pitch or near it (D2, in 3D). A single camera locates a distant foot
+Bystanders are never on the pitch or near it in 3D. A single camera locates a distant foot
 with an error of about a metre, and given 2D poses may show any person. Several cameras locate a
 track to centimetres, and so distinguish people waiting behind the lines from players.
 

@@ -1,4 +1,4 @@
-"""Rays of detections: affinity to people by distance, matching on it (T1), and quick 3D joints."""
+"""Rays of detections: affinity to people by distance, matching on it, and quick 3D joints."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def ray_affinity(
         beyond the gate.
 
     Note:
-        T1. Computation of a pair stops as soon as its joints so far put the mean beyond the gate.
+        Computation of a pair stops as soon as its joints so far put the mean beyond the gate.
     """
     cameras, detections, joint_count, _ = directions.shape
     persons = joints.shape[0]

@@ -15,9 +15,9 @@ class TrackingSettings(Record):
     """Identities in a frame depend on it and earlier frames only; else on the whole clip.
     The roster then does not limit the number of people."""
     hungarian: bool = True
-    """Match people and detections of a camera by the Hungarian method instead of greedily (T1)."""
+    """Match people and detections of a camera by the Hungarian method instead of greedily."""
     gate_m: float = Field(default=0.5, ge=1e-6, le=100)
-    """Largest mean distance of a detection's rays to the person it is matched with [m] (T1): half
+    """Largest mean distance of a detection's rays to the person it is matched with [m]: half
     the shoulder width of two people side by side, and a sprinter's way in two frames of 50 Hz."""
     min_gate_m: float = Field(default=0.25, ge=1e-6, le=100)
     """Smallest such gate [m]: half the distance of two people who stand side by side. If a camera
@@ -31,7 +31,7 @@ class TrackingSettings(Record):
     """A person's gate is at least this times that person's recent mean distance [1]: bodies that
     fall or jump leave the prediction step by step, a neighbour's detection at once."""
     epipolar_gate_m: float = Field(default=0.3, ge=1e-6, le=100)
-    """Largest mean distance between the rays of two detections of one person [m] (T2)."""
+    """Largest mean distance between the rays of two detections of one person [m]."""
     min_joints: int = Field(default=5, ge=1, le=17)
     """Least number of joints, seen on both sides, for a mean distance [1]."""
     birth_views: int = Field(default=3, ge=2, le=1000)

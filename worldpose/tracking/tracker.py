@@ -95,7 +95,7 @@ def track_people(
     """Return the person to which every camera's detections belong, in all frames.
 
     In every frame, known people take detections by ray distance, confirmed people before new ones
-    (T1); remaining detections are associated across views and start people (T2).
+   ; remaining detections are associated across views and start people.
 
     Args:
         cameras: batch (cameras,), each camera, or the cameras of `read_cameras`.
@@ -113,7 +113,7 @@ def track_people(
         InputError: the shapes do not fit together, or frames or `fps` are invalid.
 
     Note:
-        T1, T2, D2. Constant velocity between frames departs from the paper (`predict_motion`).
+        Constant velocity between frames departs from the paper (`predict_motion`).
     """
     cameras = Camera.batch(cameras)
     fps = row_rate("tracking", fps, detections.frame)

@@ -1,4 +1,4 @@
-"""Training of the bundled nets, and fine-tuning on reviewed labels, adopted if better (D5).
+"""Training of the bundled nets, and fine-tuning on reviewed labels, adopted if better.
 
 Training is seeded, checkpointed, resumable, with early stopping. Checks evaluate and keep the
 running mean of the weights (Polyak averaging), which is better at any step than the weights of the

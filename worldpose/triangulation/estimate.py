@@ -1,4 +1,4 @@
-"""Order of triangulation (T3, T4): the objective is in `residuals`.
+"""Order of triangulation: the objective is in `residuals`.
 
 1. Clocks: every camera's clock offset, from moving people.
 2. Joints of single frames, in passes (`_Passes`): each solves all joints and learns from the
@@ -244,7 +244,7 @@ def triangulate_joints(
         InputError: the shapes do not match.
 
     Note:
-        T3, T4. Residuals are pixels to first order in their length: the lens is linearised at the
+        Residuals are pixels to first order in their length: the lens is linearised at the
         observation, accurate enough for any inlier residual.
     """
     cameras = Camera.batch(cameras)

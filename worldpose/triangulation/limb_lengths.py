@@ -1,4 +1,4 @@
-"""Repairs of detector errors: left-right swaps, and joints from a wrong pair of views (T3).
+"""Repairs of detector errors: left-right swaps, and joints from a wrong pair of views.
 
 A swapped detection fits the other views only with left and right exchanged.
 

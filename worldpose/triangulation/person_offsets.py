@@ -1,4 +1,4 @@
-"""Image offset of each person in each camera, caused by calibration errors (T4).
+"""Image offset of each person in each camera, caused by calibration errors.
 
 A camera's calibration error moves all joints of a person by about the same vector in the image,
 because people are small. The vector is unknown and normal; its variance is that of calibration.
@@ -144,7 +144,7 @@ def estimate_offsets(
 ) -> tuple[Floats, Floats]:
     """Return the most probable offsets of people in the images, estimated with the joints.
 
-    T4 of the paper uses the mid-hip residual in each image as the offset, which adds the detector's
+    The paper uses the mid-hip residual in each image as the offset, which adds the detector's
     hip error to every joint. All joints together determine the offset more accurately, and cameras
     that agree get none.
 

@@ -1,4 +1,4 @@
-"""The objective of triangulation, and its terms with their derivatives (T3, T4).
+"""The objective of triangulation, and its terms with their derivatives.
 
 One joint X in one frame, from the cameras c that see it:
 

@@ -51,7 +51,7 @@ class TriangulationSettings(Record):
     """For a limb of wrong length whose end has few inlier views, choose the views that keep its
     length, or drop the end."""
     offsets: Literal["none", "midhip", "body"] = "body"
-    """How calibration errors are kept from a person's pose (T4): "none" treats the cameras as
+    """How calibration errors are kept from a person's pose: "none" treats the cameras as
     exact; "midhip" shifts every image of a person so that the mid-hips meet, as the paper does;
     "body" shifts it by the most probable offset of all joints together."""
     calibration_error_m: float = Field(default=0.03, ge=1e-6, le=10)

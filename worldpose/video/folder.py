@@ -268,7 +268,7 @@ def jumps(numbers: NDArray[np.integer], key: Flags) -> list[NDArray[np.integer]]
 
 
 def median_picture(frames: Iterable[Image], most: int = 64) -> Image:
-    """Return the median of a clip's frames, which shows no moving people (C4).
+    """Return the median of a clip's frames, which shows no moving people.
 
     At most `most` frames are in memory, evenly spread over the clip: when the limit is reached, the
     function drops every second frame and doubles the stride.

@@ -59,7 +59,7 @@ METHODS: Final = {
         Method("smpl", "SMPL file", read_smpl),
     )
 }
-"""By name, in the order of the paper's table (E5)."""
+"""By name, in the order of the paper's table."""
 
 
 def find_method(name: str) -> Method:

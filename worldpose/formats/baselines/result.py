@@ -53,7 +53,7 @@ def write_tracks(
 
 
 def write_slahmr_cameras(path: Path, camera: Camera) -> None:
-    """Write `cameras.npz` as SLAHMR reads it, for its variant with true cameras (E5).
+    """Write `cameras.npz` as SLAHMR reads it, for its variant with true cameras.
 
     Members: `height`, `width`, `focal` [px], `intrins` (frames, 4) fx fy cx cy [px] and `w2c`
     (frames, 4, 4), in world axes with y down: x as in the world, z along the world's y. The method

@@ -292,7 +292,7 @@ def read_slahmr(path: Path, model: BodyModel, _: tuple[int, int], phase: str) ->
         path: a run's folder, or one that holds the folders of all pieces at any depth.
         model: body model to pose.
         phase: phase to read; its last iteration is used. HuMoR, the motion prior, is used in
-            `motion_chunks`, not yet in `smooth_fit` (E5).
+            `motion_chunks`, not yet in `smooth_fit`.
 
     Raises:
         InputError: the folder has another layout.

@@ -1,1 +1,1 @@
-"""A camera from the paint in one image, without a click (C2)."""
+"""A camera from the paint in one image, without a click."""

@@ -1,4 +1,4 @@
-"""Candidate cameras from segments of paint, and their fit to the paint (C2).
+"""Candidate cameras from segments of paint, and their fit to the paint.
 
 A triple of segments, two along one axis of the pitch and one along the other, with names from the
 template and a camera without roll, determines a camera. The search over names is exhaustive. A

@@ -1,4 +1,4 @@
-"""Candidate cameras from a segment of paint and the circle around it (C2).
+"""Candidate cameras from a segment of paint and the circle around it.
 
 Where the centre circle, or the arc of a penalty area, is in view, one straight marking next to it
 determines a camera without roll: midfield shows no three straight markings. On the ground the

@@ -1,4 +1,4 @@
-"""Painted lines of an image whose camera is unknown: thin bright ridges on the pitch (C2).
+"""Painted lines of an image whose camera is unknown: thin bright ridges on the pitch.
 
 `line_detection` looks for bars where a camera projects the markings. Here no camera is known: the
 grass is the dominant green, paint is a thin ridge brighter than the grass on both of its sides, and

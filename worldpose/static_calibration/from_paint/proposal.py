@@ -1,4 +1,4 @@
-"""Cameras and markings proposed from an image alone, without a click (C2).
+"""Cameras and markings proposed from an image alone, without a click.
 
 Paint is the evidence. Three straight segments, two along one axis of the pitch and one along the
 other, with names from the template and a level camera, determine a camera; so do one segment and a

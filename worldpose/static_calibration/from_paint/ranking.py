@@ -1,4 +1,4 @@
-"""Different cameras that explain the paint of an image, the best first (C2)."""
+"""Different cameras that explain the paint of an image, the best first."""
 
 from __future__ import annotations
 

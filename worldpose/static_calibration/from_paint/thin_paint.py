@@ -1,4 +1,4 @@
-"""Paint of far lines, thinner than a pixel, along their projection by a known camera (C2)."""
+"""Paint of far lines, thinner than a pixel, along their projection by a known camera."""
 
 from __future__ import annotations
 

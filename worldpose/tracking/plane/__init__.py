@@ -1,1 +1,1 @@
-"""Tracks of people by their feet on the pitch plane, where views cannot triangulate (T1)."""
+"""Tracks of people by their feet on the pitch plane, where views cannot triangulate."""

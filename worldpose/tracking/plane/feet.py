@@ -196,9 +196,9 @@ def locate_feet(
         place[both] += (0.5 * along[..., None] * sight)[both]
         height_std = np.where(both, foot_height_std, 1.5 * foot_height_std)
         bottom = np.stack([0.5 * (box[..., 0] + box[..., 2]), box[..., 3]], axis=-1)
-        # A person who is cut by the image's border has no known middle or feet.
+        # A person who is cut by the image's border has no known middle or feet; the top is free.
         sides = are_at_border(box, camera.image_size)
-        inside = np.asarray(~sides[..., [0, 2, 3]].any(axis=-1))  # the feet do not depend on the head
+        inside = np.asarray(~sides[..., [0, 2, 3]].any(axis=-1))
         half = 0.5 * np.array([pitch.length, pitch.width])
         on_pitch = (np.abs(place) <= half).all(axis=-1)
         is_part = _are_parts(boxes[:, c], keypoints[:, c], confidence[:, c], here, on_pitch)

@@ -1,4 +1,4 @@
-"""Tracks of people on the pitch plane, where views cannot triangulate (T1).
+"""Tracks of people on the pitch plane, where views cannot triangulate.
 
 One camera, or cameras side by side, do not give joints in 3D; the feet give places on the pitch.
 """
@@ -84,7 +84,7 @@ def track_on_plane(
     triangulated: TriangulatedPeople | None = None,
     covering: NDArray[np.integer] | FrameBlocks | None = None,
 ) -> GroundTracks:
-    """Return the tracks of people by their feet (T1, without triangulation).
+    """Return the tracks of people by their feet without triangulation.
 
     A Kalman filter at constant velocity predicts each person. In every frame, each camera in turn
     gives its detections to the predicted people by the Hungarian method, by place and, where known,
