@@ -40,8 +40,6 @@ METHOD: tuple[Stage, ...] = (
     body_fitting.REFITTING,  # clip
     filtering.STAGE,  # clip; then again from tracking (flows/iterate.py)
 )
-    # release, evaluation               X1-X3, E1-E6
-)
 
 
 def task_modules(stages: Iterable[str]) -> list[str]:

@@ -26,6 +26,7 @@ from flows.layers import (
 )
 from flows.method import METHOD
 from flows.stage import Stage
+from worldpose.detection.models import LIBRARIES
 from worldpose.errors import InputError, UsageError, unknown_name
 from worldpose.store.store import Store
 
@@ -257,7 +258,7 @@ def _absolute_weights(value: JsonValue) -> JsonValue:
     if isinstance(value, list):
         return [_absolute_weights(each) for each in value]
     kind, colon, path = value.partition(":") if isinstance(value, str) else ("", "", "")
-    if path and kind.partition("-")[0] in ("embedded", "transformers", "onnx"):
+    if path and kind.partition("-")[0] in LIBRARIES:
         return f"{kind}{colon}{Path(path).expanduser().absolute()}"
     return value
 

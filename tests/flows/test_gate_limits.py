@@ -80,7 +80,7 @@ def held_out(before, after):
     ],
 )
 def test_auto_objects_to_figures_beyond_their_limits(gate, figures, objected):
-    lines = gate.objections(figures)
+    lines = gate.objections(figures).values()
     assert len(lines) == len(objected)
     assert all(line.startswith(start) for line, start in zip(lines, objected, strict=True))
 
