@@ -94,8 +94,8 @@ def track_people(
 ) -> Tracking:
     """Return the person to which every camera's detections belong, in all frames.
 
-    In every frame, known people take detections by ray distance, confirmed people before new ones
-   ; remaining detections are associated across views and start people.
+    In every frame, known people take detections by ray distance, confirmed people before new ones;
+    remaining detections are associated across views and start people.
 
     Args:
         cameras: batch (cameras,), each camera, or the cameras of `read_cameras`.

@@ -1,7 +1,8 @@
 """Errors of a detector: noise by joint and by confidence, and the bias that all views share.
 
-The noise is learned from residuals between a clip's views. No residual shows the common bias. But it makes bones of all persons longer or shorter for the whole clip, while human
-proportions are known.
+The noise is learned from residuals between a clip's views. No residual shows the common bias,
+but it makes bones of all persons longer or shorter for the whole clip, while human proportions are
+known.
 """
 
 from __future__ import annotations
