@@ -10,6 +10,7 @@ from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from multiprocessing.resource_tracker import ensure_running
+from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, cast
 
@@ -203,7 +204,10 @@ def require_whole(request: RunRequest) -> None:
 
 
 def _require_usable(match: Match, request: RunRequest, overrides: Overrides) -> None:
-    """Refuse a missing file that the stages of a request use, or that it states itself."""
+    """Refuse a missing file that the stages of a request use, or one that it states itself."""
+    if request.body_folder is not None and not Path(request.body_folder).expanduser().is_dir():
+        found, todo = f"no folder {request.body_folder}", "Install a body there, or name another."
+        raise UsageError("--body-folder", "a folder with installed bodies", found, todo)
     part = selected_stages(request.from_stage, request.until_stage)
     for stage in selected_stages(None, request.until_stage):
         is_used = stage in part and stage.units(match)

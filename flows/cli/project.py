@@ -196,7 +196,7 @@ def gc(
         delete: Remove the listed items; without it, only list them.
         keep_last: Also forget all but the last N runs of each match, and its last complete one.
         forget: Also forget this run.
-        older_than: Keep items younger than this [h].
+        older_than: Keep results and files of no run that are younger than this [h].
     """
     plan = plan_gc(
         store, keep_last=keep_last, forget=forget or [], older_than=timedelta(hours=older_than)

@@ -174,10 +174,10 @@ def _print(record: RunRecord, project: str, seconds: float) -> None:
     console.line(f"the results are {verdict}")
     _print_waiting(record)
     key = "median_stature_m"
-    statures = sorted(each[key] for each in record.figures.values() if key in each)
+    statures = [each[key] for each in record.figures.values() if key in each]
     if statures:
         clips = f" in {len(statures)} clips" if len(statures) > 1 else ""
-        console.line(f"median stature of the people: {statures[len(statures) // 2]:.2f} m{clips}")
+        console.line(f"median stature of the people: {median(statures):.2f} m{clips}")
     if not (record.executed or record.failed or record.waiting):
         console.line("Nothing to do: every result is current.")
     console.line(f"results: {project}/results/{record.match_id}")

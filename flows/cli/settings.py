@@ -61,6 +61,9 @@ def settings(
         list_all: List all settings with their built-in values.
         described: Describe one setting, as in --describe triangulation.min_views.
     """
+    if (list_all or described is not None) and (assignments or removed or add):
+        expected, found = "--list and --describe alone", "a change beside them"
+        raise UsageError("worldpose settings", expected, found, "Change settings without them.")
     if list_all:
         print_known()
         return

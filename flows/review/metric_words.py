@@ -32,7 +32,7 @@ _WORDS: Final[Mapping[str, str]] = {
     "corrections_refused": "corrections that do not fit any more",
     "standard_deviation_m": "uncertainty of the joints",
     "unhealthy_share": "time in which a camera is not healthy",
-    "filled_share": "frames in which no camera sees the person",
+    "filled_share": "share filled in by motion, which no camera sees",
     "held_out_error_after_m": "error in people that were kept back",
     "held_out_growth": "error in people that were kept back, relative to before",
     "offset_rms_m": "distance of bodies from the seen joints",
@@ -70,8 +70,8 @@ def quantity(name: str, value: float) -> str:
 def reason_words(reason: str) -> str:
     """Return a gate's reason in words.
 
-    `filled_share is 0.1, at most 0.05 passes` becomes `frames in which no camera sees the person:
-    10 %, limit 5 %`; a reason that a person or a method wrote stays.
+    `filled_share is 0.1, at most 0.05 passes` becomes `share filled in by motion, which no
+    camera sees: 10 %, limit 5 %`; a reason that a person or a method wrote stays.
     """
     found = _BEYOND.fullmatch(reason)
     if found is None:

@@ -131,7 +131,7 @@ def _list_settings(record: RunRecord) -> list[str]:
 def _find_cause(match: Match, record: RunRecord, parent: RunRecord | None) -> str:
     """Return why a run was made, by what differs from the run before it."""
     if parent is None:
-        return "first run"
+        return "the run before was removed" if record.parent else "first run"
     made = corrections_since(match.journal, parent.started_at, record.started_at)
     causes = [f"{made} {'correction' if made == 1 else 'corrections'}"] if made > 0 else []
     causes += ["other settings"] if parent.overrides != record.overrides else []

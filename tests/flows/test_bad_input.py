@@ -81,6 +81,7 @@ def test_a_spoilt_match_is_refused(spoil, match, project_copy):
         (["--set", "triangulation.pixel_noise_px=NaN"], "a finite number"),
         (["--set", "min_views"], "stage.name=value"),
         (["--from", "triangulation", "--until", "tracking"], "Swap the two stages"),
+        (["--body-folder", "/no/such"], "expected a folder with installed bodies"),
         (["--until", "body"], "one of ingest, proposal, static_calibration, detection"),
     ],
 )

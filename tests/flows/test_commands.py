@@ -116,6 +116,13 @@ def said(store, *arguments):
     return CliRunner().invoke(app, [*arguments, "--project", store.url])
 
 
+def test_settings_are_not_listed_and_changed_at_once(store):
+    for asked in (["--list"], ["--describe", "iterations"]):
+        answer = said(store, "settings", *asked, "--set", "iterations=2")
+        assert answer.exit_code != 0
+    assert "iterations" not in json.loads(said(store, "settings", "--json").output)["settings"]
+
+
 def test_an_edit_of_match_yaml_that_the_files_do_not_bear_out_is_refused(store, tmp_path):
     folder = made(tmp_path / "a", "a")
     register(store, folder, unfinished=True)
