@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from threading import Lock
@@ -103,26 +103,20 @@ class StoredFeedback:
     Args:
         cameras: detections of each camera, with redetected people.
         filtering: rejected keypoints and shifts of the same frames; None = first iteration.
-        filtered: leave out rejected keypoints.
-        shifted: subtract the systematic errors of keypoints.
-        redetected: keep redetected people.
+        without: results that do not apply, of `rejected`, `shift` and `redetected`.
     """
 
     def __init__(
         self,
         cameras: Sequence[xr.Dataset],
         filtering: xr.Dataset | None = None,
-        *,
-        filtered: bool = True,
-        shifted: bool = True,
-        redetected: bool = True,
+        without: Collection[str] = (),
     ) -> None:
-        used = {"rejected": filtered, "shift": shifted}
-        self._cameras, self._hide = cameras, not redetected
+        self._cameras, self._hide = cameras, "redetected" in without
         self._results = {
             name: PagedArray.of(filtering[name])
-            for name, wanted in used.items()
-            if wanted and filtering is not None
+            for name in ("rejected", "shift")
+            if name not in without and filtering is not None
         }
 
     def apply(self, name: str, values: Singles, rows: slice) -> Singles:
@@ -225,33 +219,19 @@ ADJUSTED = "bundle_adjustment/cameras"
 
 
 def open_clip(
-    inputs: UnitInputs,
-    *,
-    filtered: bool = True,
-    shifted: bool = True,
-    redetected: bool = True,
-    further: Sequence[CameraChange] = (),
+    inputs: UnitInputs, without: Collection[str] = (), further: Sequence[CameraChange] = ()
 ) -> ClipInputs:
     """Open the unit's clip; its detections are read on access.
 
     Args:
         inputs: the unit.
-        filtered: leave out keypoints that the previous iteration rejected.
-        shifted: subtract the systematic errors of keypoints.
-        redetected: include redetected people.
+        without: results of the previous iteration that do not apply, as in `StoredFeedback`.
         further: changes of cameras within the clip besides those that earlier stages found.
     """
-    detections = _open_frames(
-        inputs,
-        inputs.unit,
-        inputs.frames,
-        inputs.sources["seen"],
-        filtered=filtered,
-        shifted=shifted,
-        redetected=redetected,
-        further=further,
+    seen = inputs.sources["seen"]
+    return _open_inputs(
+        inputs, _open_frames(inputs, inputs.unit, inputs.frames, seen, without, further)
     )
-    return _open_inputs(inputs, detections)
 
 
 def _open_frames(
@@ -259,20 +239,15 @@ def _open_frames(
     clip: str,
     frame: Integers,
     names: Sequence[str],
-    *,
-    filtered: bool = True,
-    shifted: bool = True,
-    redetected: bool = True,
+    without: Collection[str] = (),
     further: Sequence[CameraChange] = (),
 ) -> KeypointDetections[ClipArray]:
     """Open rising match frames of a clip; `names` are each camera's detections."""
     seen = [select_frames(_open_detections(inputs, name), frame) for name in names]
     name = f"filtering/{clip}"
     filtering = select_frames(inputs.open(name), frame) if name in inputs else None
-    feedback = StoredFeedback(
-        seen, filtering, filtered=filtered, shifted=shifted, redetected=redetected
-    )
-    return open_detections(seen, frame, feedback, _view_corrector(inputs, clip, frame, further))
+    correct = _view_corrector(inputs, clip, frame, further)
+    return open_detections(seen, frame, StoredFeedback(seen, filtering, without), correct)
 
 
 def _view_corrector(
@@ -310,18 +285,9 @@ def known_changes(inputs: UnitInputs, clip: str) -> list[CameraChange]:
     return []
 
 
-def open_tracked_clip(
-    inputs: UnitInputs,
-    *,
-    filtered: bool = True,
-    shifted: bool = True,
-    redetected: bool = True,
-    further: Sequence[CameraChange] = (),
-) -> ClipInputs:
+def open_tracked_clip(inputs: UnitInputs, without: Collection[str] = ()) -> ClipInputs:
     """Open the unit's clip with its tracked people that are triangulated; as `open_clip`."""
-    clip = open_clip(
-        inputs, filtered=filtered, shifted=shifted, redetected=redetected, further=further
-    )
+    clip = open_clip(inputs, without)
     tracks = select_triangulated(inputs.open(f"tracking/{inputs.unit}"))
     people = clip.detections.assign_people(tracks["detection_index"].values)
     return replace(clip, detections=_on_match_clock(inputs, people), person=tracks["person"].values)

@@ -227,7 +227,7 @@ def _open_case(inputs: UnitInputs) -> _Case:
     bodies = inputs.open_first(f"refitting/{unit}", f"body_fitting/{unit}")
     placed = inputs.open(f"retriangulation/{unit}")
     return _Case(
-        clip=open_tracked_clip(inputs, filtered=False, shifted=False),
+        clip=open_tracked_clip(inputs, without=("rejected", "shift")),
         bodies=_Bodies(bodies, placed["common_bias"].values),
         placed={name: PagedArray.of(placed[name]) for name in PLACED},
         dropped=load_dropped_boxes(inputs),
@@ -292,7 +292,7 @@ def _held_out(
     used, keypoints = suspects.detections, suspects.detections.keypoints
     if not case.first:
         used = open_tracked_clip(inputs).detections[frames]
-        whole = open_tracked_clip(inputs, filtered=False, redetected=False)
+        whole = open_tracked_clip(inputs, without=("rejected", "redetected"))
         keypoints = whole.detections.keypoints[frames]
     found = measure_held_out(case.clip.cameras, used, keypoints, case.triangulation)
     if found is None:

@@ -94,7 +94,7 @@ def test_who_was_looked_for_again_is_taken_as_he_was_found_this_time():
     np.testing.assert_array_equal(taken[:, 0, 0], 95.0)
     assert np.isnan(taken[0, 0, 1]).all()
     np.testing.assert_array_equal(taken[1, 0, 1], 98.0)
-    detected = read(StoredFeedback([one], redetected=False))
+    detected = read(StoredFeedback([one], without=("redetected",)))
     np.testing.assert_array_equal(detected[:, 0, 0], 100.0)
     assert np.isnan(detected[:, 0, 1]).all()
 
