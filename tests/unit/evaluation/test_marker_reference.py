@@ -255,6 +255,23 @@ def test_places_at_another_rate_are_at_their_times(tmp_path, timed):
     assert given.frames.tolist() == list(range(29))
 
 
+@pytest.mark.parametrize(
+    ("numbers", "seconds", "periods", "rate"),
+    [
+        ([5, 6, 7, 900, 901], [0.1, 0.2, 0.3, 0.7, 0.8], ["1", "1", "1", "2", "2"], 10.0),
+        ([7000, 7100, 7200], [0.0, 0.1, 0.2], ["1", "1", "1"], 1000.0),
+    ],
+    ids=["periods", "milliseconds"],
+)
+def test_the_rate_is_that_within_periods_in_any_unit_of_frames(
+    tmp_path, numbers, seconds, periods, rate
+):
+    rows = zip(periods, seconds, numbers, strict=True)
+    lines = [f"{period},0 days 00:00:0{time:.6f},{n},3,4" for period, time, n in rows]
+    (tmp_path / "a.csv").write_text("\n".join(["period_id,timestamp,frame_id,p_x,p_y", *lines]))
+    assert read_positions(tmp_path / "a.csv")[3] == pytest.approx(rate)
+
+
 def test_people_who_hardly_move_do_not_tell_the_rate_of_places_without_times(tmp_path):
     mine, places = tracks()
     mine = JointTracks(mine.frames - 100, mine.person_ids, np.tile(mine.joints[:1], (30, 1, 1, 1)))

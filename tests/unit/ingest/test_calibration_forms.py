@@ -134,6 +134,17 @@ def test_a_camera_of_panoptic_with_skew_pixels_is_left_out(tmp_path):
     assert "skew" in left_out["b2"]
 
 
+def test_cameras_whose_poses_are_all_zero_have_none(tmp_path):
+    zero = {"rotation": tuple(map(tuple, np.eye(3).tolist())), "translation": (0.0,) * 3}
+    known = [rig()[0], *(one.model_copy(update=zero) for one in rig()[1:])]
+    write_calibration_toml(tmp_path / "c.toml", {one.id: one for one in known})
+    left_out = LeftOut()
+    assert list(read_calibration(tmp_path / "c.toml", left_out=left_out)) == ["a1"]
+    assert list(left_out) == ["b2", "c3"]
+    with pytest.raises(InputError, match=r"b2, c3: expected poses, found .* all zero"):
+        read_calibration(tmp_path / "c.toml")
+
+
 @pytest.mark.parametrize(("unit", "metres"), [("mm", 1e-3), ("cm", 1e-2), ("m", 1.0)])
 def test_a_list_of_cameras_as_panoptics_may_have_another_unit(tmp_path, unit, metres):
     known = rig(lens=(0.0,) * 5)
