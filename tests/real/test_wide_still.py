@@ -65,7 +65,7 @@ def test_calibration_without_clicks_places_feet_or_is_refused(lens):
     people = [
         np.array(one["smpl_matrix_world"])[:3, 3] for one in things if one["class"] == "human"
     ]
-    feet = np.array(people)[:, :3, 3] @ WORLD.T
+    feet = np.array(people) @ WORLD.T
     given = LensCalibration(
         id="wide",
         image_size=tuple(SIZE.tolist()),

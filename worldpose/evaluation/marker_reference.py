@@ -23,6 +23,7 @@ from worldpose.evaluation.matching import (
 )
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.rigid import Similarity, align
+from worldpose.parsing import decimal_point
 
 METRES: Final = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Length of each unit in such files [m]."""
@@ -183,14 +184,14 @@ def _read_trc(path: Path) -> tuple[float, tuple[str, ...], Floats, str, float]:
     width = 2 + 3 * len(names)
     rows = [
         [
-            float(cell) if cell.strip() else np.nan
+            float(decimal_point(cell.strip()) or "nan")
             for cell in (line.split("\t") + [""] * width)[:width]
         ]
         for line in lines[5:]
         if line.strip()
     ]
     table = np.array(rows, dtype=np.float64).reshape(len(rows), width)
-    rate = float(about["DataRate"])
+    rate = float(decimal_point(about["DataRate"]))
     place = _samples(path, table[:, 0], rate * table[:, 1])
     points = np.full((place[-1] + 1 if len(place) else 0, len(names), 3), np.nan)
     points[place] = table[:, 2:].reshape(len(rows), len(names), 3)

@@ -34,17 +34,20 @@ def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float
         table = table.rename(columns=ours).set_index("frame").sort_index()
         rate = np.nan
         if "timestamp" in table:
-            time = table["timestamp"].groupby(level=0).first()
-            if not pd.api.types.is_numeric_dtype(time):
-                time = pd.to_timedelta(time, errors="coerce").dt.total_seconds()
-            rows = np.array([time.index.to_numpy(np.float64), time.to_numpy(np.float64)])
+            each = table.groupby(level=0).first()
+            time, most = each["timestamp"], 240.0  # if there are more, times are in minutes or so
+            if not pd.api.types.is_numeric_dtype(time):  # frames may be counted in milliseconds
+                time, most = pd.to_timedelta(time, errors="coerce").dt.total_seconds(), np.inf
+            period = pd.factorize(each["period_id"])[0] if "period_id" in each else 0.0 * time
+            rows = np.array([time.index, time, period], np.float64)
             # A clock may be coarser than a frame: only rows at which it moves on are exact.
             steps = np.diff(rows[:, 1:][:, np.diff(rows[1]) != 0.0])
-            steps = steps[:, steps[1] > 0.0]  # times begin again in each period
+            # Times begin again in each period, and perhaps later than the last one of before.
+            steps = steps[:, (steps[1] > 0.0) & (steps[2] == 0.0)]
             rate = float(steps[0].sum() / steps[1].sum()) if steps.size else np.nan
             while 0.0 < rate < 1.0:  # times are in ms or smaller units
                 rate *= 1000.0
-            rate = rate if rate <= 240.0 else np.nan  # times are in minutes or the like
+            rate = rate if rate <= most else np.nan
         if {"person", "x", "y"} <= {*table}:
             named = "name" in table and table["name"].notna().all()
             who = table["name" if named else "person"]

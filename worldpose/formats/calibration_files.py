@@ -26,7 +26,7 @@ from pydantic import ValidationError
 
 from data_contracts.cameras import COEFFICIENTS, CameraCalibration, LensName
 from worldpose.errors import InputError, describe_value
-from worldpose.formats.calibration_unit import toml_unit_m
+from worldpose.formats.calibration_unit import require_optics, toml_unit_m
 from worldpose.formats.files import read_toml
 
 NUMBER_LIMIT: Final = 1e9
@@ -116,40 +116,6 @@ def build_camera(
         raise calibration_error(
             f"{where}: name", "up to 64 letters, digits and . _ -, none of . _ - first", repr(name)
         ) from invalid
-
-
-def require_optics(
-    where: str,
-    size: NDArray[np.float64],
-    focal: NDArray[np.float64],
-    principal_point: NDArray[np.float64],
-) -> None:
-    """Raise InputError for a focal length or principal point impossible at this image size.
-
-    A principal point in the middle of an image of the exchanged size shows that it is exchanged.
-    """
-    # Maximum distance of the principal point from the image center, in longer sides [1].
-    center_sizes = 10
-    # Minimum and maximum focal length over the image's longer side [1]: a field of view of
-    # 168 degrees, and a telescope's of 0.06.
-    focal_ratios = (0.05, 1000.0)
-    ratio = focal / np.max(size)
-    if np.any(ratio < focal_ratios[0]) or np.any(ratio > focal_ratios[1]):
-        low, high = (bound * float(np.max(size)) for bound in focal_ratios)
-        expected = f"positive pixels, {low:g} to {high:g} for {size[0]:g} x {size[1]:g}"
-        todo = "Give it in pixels: focal length in mm / sensor width in mm * image width."
-        raise InputError(f"{where}: focal length", expected, str(focal.tolist()), todo)
-    if np.any(np.abs(principal_point - size / 2) > center_sizes * np.max(size)):
-        expected = f"pixels within {center_sizes} image sizes of the image's centre"
-        todo = "Give it in pixels from the image's top-left corner."
-        raise InputError(f"{where}: principal point", expected, str(principal_point.tolist()), todo)
-    away = [float(np.abs(principal_point / each - 0.5).max()) for each in (size, size[::-1])]
-    if away[0] > 0.2 and away[1] < 0.1:
-        expected = (
-            f"width and height with the principal point {principal_point.tolist()} near the middle"
-        )
-        found = f"width {size[0]:g} and height {size[1]:g}, which seem to be exchanged"
-        raise InputError(f"{where}: size", expected, found, "Exchange them.")
 
 
 def camera_id(name: str) -> str:
@@ -350,6 +316,12 @@ def plain_key(key: str) -> str:
     return key if len(key) == 1 else key.replace("_", "").lower()
 
 
+def tells_model(key: str) -> bool:
+    """Return whether an entry's name is one of a lens model, or contains such a word."""
+    plain = plain_key(key)
+    return plain in MODEL_NAMES or re.search("fisheye|lens|model|projection", plain) is not None
+
+
 def read_model(where: str, given: Mapping[str, Any]) -> tuple[bool, bool]:
     """Return whether a lens's entries say, under any usual name, a fisheye, or a word of one order.
 
@@ -362,14 +334,16 @@ def read_model(where: str, given: Mapping[str, Any]) -> tuple[bool, bool]:
     )
     lens_part += r"|^(pinhole_)?(omni|equi|e?ucm|fov|mei|poly\d*|ds|eq)(_none|_radtan)?$"
     said = {}
-    for key in [key for key in given if plain_key(key) in MODEL_NAMES]:
-        values = np.ravel(np.asarray(given[key], object))
+    for key in filter(tells_model, given):
+        plain, values = plain_key(key), np.ravel(np.asarray(given[key], object))
         is_word = len(values) == 1 and isinstance(values[0], str | int | float | None)
         word = re.sub(r"[ -]+", "_", str(values[0] if is_word else given[key]).lower())
         is_other = not is_word or not re.search(lens_part, word)
-        if word in FISHEYE_WORDS + OTHER_WORDS:
+        # Of entries of other names, such as lens or is_fisheye, a number tells the last alone.
+        first = 0 if plain in MODEL_NAMES or "fisheye" in plain else 3
+        if word in FISHEYE_WORDS[first:] + OTHER_WORDS[first:]:
             said[word] = key
-        elif not (plain_key(key) in MODEL_NAMES[-6:] and is_other):
+        elif plain in MODEL_NAMES[:-6] or not is_other:
             words = ", ".join((*OTHER_WORDS[3:], *FISHEYE_WORDS[3:]))
             raise calibration_error(f"{where}: {key}", f"one of {words}", f"{word!r:.60}")
     yes = said.keys() & set(FISHEYE_WORDS)

@@ -112,6 +112,14 @@ def read_calibration(
     """
     form, files = find_calibration(path) if path.is_dir() else _form_of(path)
     cameras = form.read(files, sizes, left_out)
+    poses = {name: np.c_[one.rotation, one.translation] for name, one in cameras.items()}
+    at_zero = [name for name, pose in poses.items() if np.array_equal(pose, np.eye(3, 4))]
+    if len(at_zero) > 1:  # a single one may be that from which the others are counted
+        if left_out is None:
+            where = f"{path}: {', '.join(at_zero)}"
+            raise calibration_error(where, "poses", "rotation and translation that are all zero")
+        left_out.update(dict.fromkeys(at_zero, "it has no pose: rotation and translation are zero"))
+        cameras = {name: camera for name, camera in cameras.items() if name not in at_zero}
     if not any_unit:
         require_metres(path, cameras, form_unit_m(path))
     if left_out is not None:

@@ -66,15 +66,15 @@ def _read_panoptic(
     The many cameras of low resolution have a skew, and are left out.
     """
     keys = Keys("resolution", "K", "distCoef", "R", "t")
-    skewed = [_has_skew(table.get("K")) for table in cameras]
+    lacks = [_panoptic_lack(table) for table in cameras]
     found = []
     # (3, 3) from a world with y down to one with z up: x stays, y becomes z, z becomes minus y.
     y_down = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     for index, table in enumerate(cameras):
         where = f"{path}: cameras[{index}]"
         name = str(table.get("name", ""))
-        if left_out is not None and skewed[index] and not all(skewed):
-            left_out[camera_id(name)] = "its pixels are skew (K[0][1]), which no lens model has"
+        if left_out is not None and lacks[index] and not all(lacks):
+            left_out[camera_id(name)] = lacks[index]
             continue
         camera = read_camera_table(
             where, name, table, keys=keys, unit_m=_CENTIMETRE, axes=y_down, where_pose=where
@@ -83,11 +83,15 @@ def _read_panoptic(
     return index_by_name(path, found)
 
 
-def _has_skew(matrix: object) -> bool:
+def _panoptic_lack(table: Mapping[str, Any]) -> str:
+    """Return why a camera is left out; empty if it is not."""
+    if not table.get("R") and not table.get("t"):
+        return "it has no pose"
     try:
-        return abs(float(matrix[0][1])) > 1e-9  # type: ignore[index] # the reader names a fault
+        is_skew = abs(float(table["K"][0][1])) > 1e-9
     except (TypeError, ValueError, IndexError, KeyError):
-        return False
+        return ""  # the reader names the fault
+    return "its pixels are skew (K[0][1]), which no lens model has" if is_skew else ""
 
 
 def _read_multical(

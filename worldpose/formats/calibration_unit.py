@@ -136,3 +136,37 @@ def square_focal(focal: Sequence[float], where: str) -> tuple[float, float]:
             todo="Correct the calibration file.",
         )
     return 0.5 * (fx + fy), 0.5 * abs(fx - fy)
+
+
+def require_optics(
+    where: str,
+    size: NDArray[np.float64],
+    focal: NDArray[np.float64],
+    principal_point: NDArray[np.float64],
+) -> None:
+    """Raise InputError for a focal length or principal point impossible at this image size.
+
+    A principal point in the middle of an image of the exchanged size shows that it is exchanged.
+    """
+    # Maximum distance of the principal point from the image center, in longer sides [1].
+    center_sizes = 10
+    # Minimum and maximum focal length over the image's longer side [1]: a field of view of
+    # 168 degrees, and a telescope's of 0.06.
+    focal_ratios = (0.05, 1000.0)
+    ratio = focal / np.max(size)
+    if np.any(ratio < focal_ratios[0]) or np.any(ratio > focal_ratios[1]):
+        low, high = (bound * float(np.max(size)) for bound in focal_ratios)
+        expected = f"positive pixels, {low:g} to {high:g} for {size[0]:g} x {size[1]:g}"
+        todo = "Give it in pixels: focal length in mm / sensor width in mm * image width."
+        raise InputError(f"{where}: focal length", expected, str(focal.tolist()), todo)
+    if np.any(np.abs(principal_point - size / 2) > center_sizes * np.max(size)):
+        expected = f"pixels within {center_sizes} image sizes of the image's centre"
+        todo = "Give it in pixels from the image's top-left corner."
+        raise InputError(f"{where}: principal point", expected, str(principal_point.tolist()), todo)
+    away = [float(np.abs(principal_point / each - 0.5).max()) for each in (size, size[::-1])]
+    if away[0] > 0.2 and away[1] < 0.1:
+        expected = (
+            f"width and height with the principal point {principal_point.tolist()} near the middle"
+        )
+        found = f"width {size[0]:g} and height {size[1]:g}, which seem to be exchanged"
+        raise InputError(f"{where}: size", expected, found, "Exchange them.")

@@ -240,9 +240,18 @@ def order_by_points(where: str, points: AnyFloats, stated: str | None = None) ->
         most = plausible if np.isnan(misfits[0]) else wrong
         if misfit <= most and not misfits[0] - misfit < _MARGIN:
             chosen = order
+    # Limbs that are hidden in all frames: a few others tell, of which a right order misses less.
+    few = [_misfit(order.select(points), pairs, _LENGTHS, 4) for order in orders]
+    if np.isnan(misfits).all() and np.nanmin([*few, np.inf]) <= plausible:
+        chosen = orders[int(np.nanargmin(few))]
     if size == len(COCO17):
-        other = _misfit(points, np.reshape(_HUMAN36M, (5, 2, 2)), _HUMAN36M_LENGTHS)
-        if other <= plausible and not misfits[0] - other < _MARGIN:
+        human = (points, np.reshape(_HUMAN36M, (5, 2, 2)), _HUMAN36M_LENGTHS)
+        other, by_few = _misfit(*human), _misfit(*human, 4)
+        is_other = other <= plausible and not misfits[0] - other < _MARGIN
+        if np.isnan(misfits[0]):
+            is_other |= by_few <= plausible and few[0] - by_few > _MARGIN
+        seen: Flags = np.asarray((points[..., 2] > 0.0).any(axis=0))
+        if is_other or (seen[7:11].any() and not seen[5:7].any()):  # arms, but no shoulder
             found = "thighs, shanks and arms as in the order of Human3.6M"
             todo = "Estimate poses with a model of COCO, or write COCO's joints."
             raise InputError(where, "the 17 joints in COCO's order", found, todo)
@@ -292,20 +301,22 @@ def unknown_size(where: str, size: int) -> InputError:
     return InputError(where, expected, f"{size} points", todo)
 
 
-def _misfit(points: AnyFloats, pairs: NDArray[np.int64], lengths: Floats) -> float:
+def _misfit(points: AnyFloats, pairs: NDArray[np.int64], lengths: Floats, least: int = 8) -> float:
     """Return the mean deviation of people's lengths [log] from the usual ones; NaN if unknown.
 
     Args:
         points: (people, points, 3).
         pairs: (bones, 2, 2) places of the ends of the left and right bone.
         lengths: (bones,) usual lengths, of which only ratios count.
+        least: fewest bones that have to be known; with 8 of 10 the face may be hidden.
     """
     sample = 2000  # people whose lengths are compared; more add nothing
     some = points[:: max(1, len(points) // sample)]
-    place = np.where(some[..., 2:] > 0.0, some[..., :2], np.nan).astype(np.float64)
+    there = (some[..., 2:] > 0.0) & some[..., :2].any(axis=-1, keepdims=True)  # as `clean_points`
+    place = np.where(there, some[..., :2], np.nan).astype(np.float64)
     span = np.linalg.norm(place[:, pairs[..., 0]] - place[:, pairs[..., 1]], axis=-1)
     known = np.isfinite(span).any(axis=0)
-    if known.sum() < known.size - 2:  # the face may be hidden
+    if known.sum() < least:
         return float("nan")
     typical = np.nanmedian(span[:, known], axis=0)
     usual = np.broadcast_to(lengths[:, None], known.shape)[known]

@@ -27,9 +27,9 @@ from worldpose.formats.calibration_files import (
     camera_tables,
     plain_key,
     read_optics,
-    require_optics,
+    tells_model,
 )
-from worldpose.formats.calibration_unit import require_middle, square_focal
+from worldpose.formats.calibration_unit import require_middle, require_optics, square_focal
 from worldpose.formats.calibration_writer import order_entry
 from worldpose.formats.files import (
     SETTINGS_BYTES,
@@ -111,7 +111,7 @@ def read_lenses(
         "size": list(own or sizes[camera]),
         "matrix": (matrix.reshape(3, 3) if matrix.shape == (9,) else matrix).tolist(),
         "distortions": distortion.tolist(),
-        **{key: value for key, value in given.items() if plain_key(key) in MODEL_NAMES},
+        **{key: value for key, value in given.items() if tells_model(key)},
     }
     return {camera: _lens(where, camera, table, sizes[camera], has_size=own is not None)}
 

@@ -115,6 +115,9 @@ def test_rows_of_trc_are_at_their_frames_and_zeros_are_missing(tmp_path, numbers
     np.testing.assert_array_equal(found.points[:, 0, 0], [1.0, *[np.nan] * 3, 2.0])
     np.testing.assert_array_equal(found.points[:, 1, 0], [1.0, 1.0, np.nan, np.nan, 1.0])
     assert found.zeros == 1
+    commas = "\n".join(line.replace(".", ",") for line in [*text[:2], "100.0\tm", *text[3:]])
+    (tmp_path / "a.trc").write_text(commas + "\n")
+    np.testing.assert_array_equal(read_markers(tmp_path / "a.trc").points, found.points)
     (tmp_path / "a.trc").write_text("\n".join([*text[:6], text[7], text[6].replace("0.0", "")]))
     with pytest.raises(InputError, match="that rise"):
         read_markers(tmp_path / "a.trc")
@@ -253,6 +256,23 @@ def test_places_at_another_rate_are_at_their_times(tmp_path, timed):
     scores, _ = evaluate_joints(predicted, given, fps=25.0)
     assert scores.mpjpe_mm == pytest.approx(0.0, abs=1.0)
     assert given.frames.tolist() == list(range(29))
+
+
+@pytest.mark.parametrize(
+    ("numbers", "seconds", "periods", "rate"),
+    [
+        ([5, 6, 7, 900, 901], [0.1, 0.2, 0.3, 0.7, 0.8], ["1", "1", "1", "2", "2"], 10.0),
+        ([7000, 7100, 7200], [0.0, 0.1, 0.2], ["1", "1", "1"], 1000.0),
+    ],
+    ids=["periods", "milliseconds"],
+)
+def test_the_rate_is_that_within_periods_in_any_unit_of_frames(
+    tmp_path, numbers, seconds, periods, rate
+):
+    rows = zip(periods, seconds, numbers, strict=True)
+    lines = [f"{period},0 days 00:00:0{time:.6f},{n},3,4" for period, time, n in rows]
+    (tmp_path / "a.csv").write_text("\n".join(["period_id,timestamp,frame_id,p_x,p_y", *lines]))
+    assert read_positions(tmp_path / "a.csv")[3] == pytest.approx(rate)
 
 
 def test_people_who_hardly_move_do_not_tell_the_rate_of_places_without_times(tmp_path):

@@ -1,6 +1,7 @@
 """Points in files of 2D poses: their order by name, by model, by lengths; and forms of JSON."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -120,6 +121,33 @@ def test_an_order_is_told_without_faces_and_of_people_seen_from_the_side(tmp_pat
     found = read_openpose_folder(folder)
     assert found.kind == "BODY_25B"
     np.testing.assert_allclose(found.people.keypoints[0, 0, 15], (530, 690))
+
+
+@pytest.mark.parametrize(
+    "hidden", ["knee|ankle", "elbow|wrist", "nose|eye|knee|ankle"], ids=["legs", "arms", "both"]
+)
+@pytest.mark.parametrize(
+    ("names", "kind"), [(BODY25, "BODY_25"), (BODY_25B, "BODY_25B"), (HUMAN36M, "Human3.6M")]
+)
+def test_an_order_is_told_where_limbs_are_hidden_in_all_frames(tmp_path, names, kind, hidden):
+    person = np.reshape(points(names), (-1, 3))
+    person[[re.search(hidden, name) is not None for name in names]] = 0.0
+    file = tmp_path / "a.json"
+    file.write_text(json.dumps([{"image_id": 0, "keypoints": person.ravel().tolist()}]))
+    if kind == "Human3.6M":
+        with pytest.raises(InputError, match=kind):
+            read_coco_results(file)
+        return
+    assert read_coco_results(file).kind == kind
+
+
+def test_hidden_points_at_the_origin_with_a_confidence_tell_no_lengths(tmp_path):
+    person = np.reshape(points(COCO17), (-1, 3))
+    person[13:] = 0.0, 0.0, 0.3  # as Ultralytics writes points below its threshold
+    people = [{"image_id": n, "keypoints": person.ravel().tolist()} for n in range(25)]
+    (tmp_path / "a.json").write_text(json.dumps(people))
+    found = read_coco_results(tmp_path / "a.json").people
+    assert np.isnan(found.confidence[:, 0]).all(axis=0).tolist() == [False] * 13 + [True] * 4
 
 
 def test_neck_and_top_of_the_head_in_place_of_eyes_are_no_eyes(tmp_path):

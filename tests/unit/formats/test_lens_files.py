@@ -149,8 +149,7 @@ def test_json_with_several_cameras_gives_their_lenses_by_name(form, tmp_path):
 def test_a_size_in_the_file_counts_in_any_form(tmp_path, size):
     twice = {"K": np.diag([2.0, 2.0, 1.0]) @ MATRIX, "dist": DISTORTION}
     lens = {key: value.tolist() for key, value in twice.items()}
-    file = tmp_path / "lens.json"
-    file.write_text(json.dumps({**lens, **size}))
+    (file := tmp_path / "lens.json").write_text(json.dumps({**lens, **size}))
     found = read_lenses([file], "left", SIZES)["left"]
     assert found.focal_px == pytest.approx(1402.0)
     for none in ({}, dict.fromkeys(size, "large"), dict.fromkeys(size)):
@@ -445,7 +444,8 @@ def test_every_lens_file_says_which_model_it_has(model, tmp_path):
 
 @pytest.mark.parametrize(
     "said",
-    ["model: Fisheye", "camera_model: OPENCV_FISHEYE", "type: fisheye", "projection: equidistant"],
+    ["model: Fisheye", "camera_model: OPENCV_FISHEYE", "type: fisheye", "projection: equidistant"]
+    + ["lens: fisheye", "is_fisheye: True", "calibration_model: kannala brandt"],
 )
 def test_a_fisheye_is_known_by_every_usual_name(said, tmp_path):
     key, _, word = said.partition(": ")
@@ -472,7 +472,7 @@ def test_a_fisheye_is_known_by_every_usual_name(said, tmp_path):
         ("projection: [[4, 0, 3, 0], [0, 4, 2, 0], [0, 0, 1, 0]]\nlens_model: Sigma 24mm", "brown"),
         ("projection: rectilinear\ntype: RadialTangential\nmodel: Meike 25mm", "brown"),
         ("distortion_model: radial_tangential\nmodel: GoPro HERO12 wide FOV", "brown"),
-        ("distortion_type: polynomial\nmodel: OmniVision OV9281", "brown"),
+        ("distortion_type: polynomial\nmodel: OmniVision OV9281\nlens_id: 1", "brown"),
         ("fisheye: true\nmodel: opencv\ndistortion_model: none", "fisheye"),
     ],
 )

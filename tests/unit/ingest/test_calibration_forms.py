@@ -124,14 +124,27 @@ def test_a_camchain_counts_by_the_numbers_of_its_cameras(tmp_path):
     assert len(read_lenses([path], None, dict.fromkeys(found, (1280, 720)))) == 11
 
 
-def test_a_camera_of_panoptic_with_skew_pixels_is_left_out(tmp_path):
+def test_cameras_of_panoptic_with_skew_pixels_or_without_a_pose_are_left_out(tmp_path):
     path = WRITERS["Panoptic"](tmp_path, rig())
     content = json.loads(path.read_text())
     content["cameras"][1]["K"][0][1] = 0.403304
+    content["cameras"][2] |= {"R": None, "t": None}
     path.write_text(json.dumps(content))
     left_out = LeftOut()
-    assert list(read_calibration(path, left_out=left_out)) == ["a1", "c3"]
+    assert list(read_calibration(path, left_out=left_out)) == ["a1"]
     assert "skew" in left_out["b2"]
+    assert "no pose" in left_out["c3"]
+
+
+def test_cameras_whose_poses_are_all_zero_have_none(tmp_path):
+    zero = {"rotation": tuple(map(tuple, np.eye(3).tolist())), "translation": (0.0,) * 3}
+    known = [rig()[0], *(one.model_copy(update=zero) for one in rig()[1:])]
+    write_calibration_toml(tmp_path / "c.toml", {one.id: one for one in known})
+    left_out = LeftOut()
+    assert list(read_calibration(tmp_path / "c.toml", left_out=left_out)) == ["a1"]
+    assert list(left_out) == ["b2", "c3"]
+    with pytest.raises(InputError, match=r"b2, c3: expected poses, found .* all zero"):
+        read_calibration(tmp_path / "c.toml")
 
 
 @pytest.mark.parametrize(("unit", "metres"), [("mm", 1e-3), ("cm", 1e-2), ("m", 1.0)])

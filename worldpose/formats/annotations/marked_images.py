@@ -86,11 +86,24 @@ def read_marked_images(path: Path) -> list[MarkedImage]:
             raise ContentError(f"no JSON: {error}") from error
         if not any(image.points or image.lines for image in found):
             raise ContentError("no labelled point or line")
+        for image in found:
+            _require_pixels(image)
         return [image for image in found if image.points or image.lines or image.left_out]
 
     expected = "labelled points of CVAT (XML 1.1), Label Studio or COCO, or SoccerNet's lines"
     todo = "Export the clicks from the annotator in one of these forms."
     return decode_file(path, max_bytes, decode, expected, todo)
+
+
+def _require_pixels(image: MarkedImage) -> None:
+    """Raise ContentError if places are shares or pixels where the form has another unit."""
+    places = np.array([*(at for _, at in image.points), *(p for _, at in image.lines for p in at)])
+    if image.size is None or len(places) < 3:
+        return
+    share = (places + CORNER) / image.size
+    if (np.abs(share) <= 0.011).all() or (np.abs(share - 0.5) > 1.0).any(axis=1).mean() > 0.5:
+        found = f"{share.min():.3g} to {share.max():.3g} times the image's sides"
+        raise ContentError(f"{image.name}: places of {found}: in another unit?")
 
 
 def _read_cvat(content: bytes) -> Iterator[MarkedImage]:

@@ -18,6 +18,7 @@ from worldpose.formats.annotations import (
     write_annotations,
 )
 from worldpose.formats.annotations.annotated_images import AnnotatedImage, AnnotatedPerson
+from worldpose.formats.annotations.marked_images import read_marked_images
 
 SIZE = (1920, 1080)
 
@@ -192,3 +193,20 @@ def test_what_is_hostile_or_damaged_is_refused_with_its_file_and_reason(tmp_path
         read_annotations(file)
     assert str(file) in str(refusal.value)
     assert len(str(refusal.value)) < 600  # no content of the file is poured out
+
+
+@pytest.mark.parametrize("unit", [0.01, 10.0], ids=["shares", "pixels"])
+def test_clicks_in_another_unit_than_per_cent_are_refused(tmp_path, unit):
+    region = {"type": "keypointlabels", "original_width": 1000, "original_height": 1000}
+    places = [(20.0, 30.0), (70.0, 40.0), (55.0, 90.0), (104.0, 50.0)]
+
+    def write(scale):
+        values = [{"x": scale * x, "y": scale * y, "keypointlabels": ["a"]} for x, y in places]
+        result = [{**region, "value": value} for value in values]
+        task = {"data": {"image": "a.png"}, "annotations": [{"result": result}]}
+        (tmp_path / "a.json").write_text(json.dumps([task]))
+        return tmp_path / "a.json"
+
+    assert len(read_marked_images(write(1.0))[0].points) == 4
+    with pytest.raises(InputError, match=r"a\.png: places of .* times the image's sides"):
+        read_marked_images(write(unit))
