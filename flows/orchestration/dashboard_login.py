@@ -13,14 +13,12 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from flows.orchestration.prefect_environment import authorization
 from flows.web.access import Access
-from flows.web.guard import identify
+from flows.web.guard import OPEN, identify
 from flows.web.host_guard import SAFE_METHODS, refusal
 from flows.web.sessions import login_app
 
-FORM: Final = frozenset(
-    {"/login", "/login/page.js", "/login/page.css", "/api/login", "/api/session"}
-)
-"""Paths of the log-in form; Prefect's own form asks for its password."""
+FORM: Final = OPEN - {"/api/health"} | {"/api/session"}
+"""Paths of the log-in form; Prefect's own `/login` would ask for its password."""
 CHECK_SECONDS: Final = 1.0
 """Interval at which the session of an open WebSocket is checked [s]."""
 
@@ -57,17 +55,14 @@ class DashboardLogin:
             await self.form(scope, receive, send)
         elif who is not None and role == "approver" and (is_own or method in SAFE_METHODS):
             await (self._ask if method else self._stream)(scope, receive, send)
-        elif not is_page or "authorization" in headers:
+        elif not is_page or "authorization" in headers or not (who or self.form_paths):
             await self.app(scope, receive, send)
         elif who is not None:
             refused = refusal(403, f"the role of {who}, {role}, does not allow this")
             await refused(scope, receive, send)
-        elif self.form_paths:
-            query = scope["query_string"].decode("latin-1")
-            asked = quote(scope["path"] + (f"?{query}" if query else ""), safe="/")
-            await RedirectResponse(f"/login?next={asked}", status_code=303)(scope, receive, send)
         else:
-            await self.app(scope, receive, send)
+            asked = quote(f"{scope['path']}?{scope['query_string'].decode('latin-1')}", safe="/")
+            await RedirectResponse(f"/login?next={asked}", status_code=303)(scope, receive, send)
 
     async def _ask(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on with the login; the dashboard's settings then name no login."""

@@ -56,13 +56,8 @@ def login_app(access: Access) -> ASGIApp:
 def login_routes(access: Access) -> APIRouter:
     """Create the routes that begin and end sessions, and the files of the form."""
     folder = files("flows.web") / "login"
-    router = file_routes(
-        {
-            "/login": folder / "page.html",
-            "/login/page.js": folder / "page.js",
-            "/login/page.css": folder / "page.css",
-        }
-    )
+    parts = {f"/login/{name}": folder / name for name in ("page.js", "page.css")}
+    router = file_routes({"/login": folder / "page.html", **parts})
 
     @router.post("/api/login")
     def login(given: Login, request: Request) -> JSONResponse:
@@ -121,7 +116,6 @@ def _answer(name: str, content: bytes) -> Callable[[], Response]:
 def answer_malformed(request: Request, error: RequestValidationError) -> JSONResponse:
     """Say which part of a request is malformed."""
     first = error.errors()[0]
-    place = ".".join(str(part) for part in first["loc"])
-    said = f"{place}: {first['msg']}"
+    said = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
     # A key of the body can contain lone surrogates, which a response cannot.
     return JSONResponse({"error": said.encode("utf-8", "replace").decode()}, status_code=422)
