@@ -12,8 +12,8 @@ export const browser = await chromium.launch({
 });
 
 // A new page, of a new person or a given context, whose errors and requests to other machines are kept.
-export async function open(seen, height = 768, context = browser) {
-  const page = await context.newPage({ viewport: { width: 1366, height } });
+export async function open(seen, height = 768, context = null) {
+  const page = await (context ?? (await browser.newContext({ viewport: { width: 1366, height } }))).newPage();
   page.setDefaultTimeout(120000);
   page.on("pageerror", (error) => seen.errors.push(error.message));
   page.on("console", (message) => {
