@@ -11,9 +11,9 @@ export const browser = await chromium.launch({
     "--disable-background-networking", "--disable-component-update"],
 });
 
-// A new page, whose errors and requests to other machines are kept.
-export async function open(seen, height = 768) {
-  const page = await browser.newPage({ viewport: { width: 1366, height } });
+// A new page, of a new person or a given context, whose errors and requests to other machines are kept.
+export async function open(seen, height = 768, context = null) {
+  const page = await (context ?? (await browser.newContext({ viewport: { width: 1366, height } }))).newPage();
   page.setDefaultTimeout(120000);
   page.on("pageerror", (error) => seen.errors.push(error.message));
   page.on("console", (message) => {

@@ -1,5 +1,6 @@
 """A project served by `worldpose serve`, and a client."""
 
+import http.client
 import json
 import os
 import signal
@@ -142,6 +143,20 @@ class Browser:
             said = {"verdict": "approve", "seen": dict.fromkeys(waiting, "waits")}
             self.ask(f"/api/matches/{match}/decisions", {"reviews": waiting, **said})
         return len(waiting)
+
+
+def request(port, method, path, headers=None, body=None):
+    """Status, headers and content of any request at all."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+    given = {"host": f"127.0.0.1:{port}", **(headers or {})}
+    content = None if body is None else json.dumps(body)
+    if body is not None:
+        given.setdefault("content-type", "application/json")
+    connection.request(method, path, content, given)
+    answer = connection.getresponse()
+    found = answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read()
+    connection.close()
+    return found
 
 
 def fetch(address, body=None, headers=None, opener=None):

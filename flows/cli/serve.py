@@ -153,7 +153,8 @@ def _print_addresses(
     login_at = plan.state_folder.prefect_login if is_kept else variable
     is_given = METRICS_TOKEN in os.environ
     token_at = METRICS_TOKEN if is_given else plan.state_folder.metrics_token
-    login = f"its login is in {login_at}"
+    also = "the log-in of the pages opens it; " if plan.owns_prefect else ""
+    login = f"{also}its clients' is in {login_at}"
     if not asks_for_login:
         login = "which asks for no login: others may use it"
     told = {

@@ -30,6 +30,8 @@ from worldpose.errors import UsageError
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+    from flows.web.access import Access
+
 MAX_CONNECTIONS: Final = 1000
 """Maximum open connections: every run and every one of its workers has several."""
 BUSY: Final = 503
@@ -40,10 +42,13 @@ PAUSE_SECONDS: Final = 0.5
 """Pause before each repetition [s]."""
 
 
-def guarded_app(names: Iterable[str], *, is_embedded: bool = False) -> ASGIApp:
+def guarded_app(
+    names: Iterable[str], access: Access | None = None, *, is_embedded: bool = False
+) -> ASGIApp:
     """Create Prefect's API, and its dashboard unless embedded, for requests that name this server.
 
-    An embedded one lasts as long as one run. Loopback's names need not be given.
+    An embedded one lasts as long as one run. Loopback's names need not be given. With `access`, a
+    session of the pages opens it, too.
 
     Raises:
         UsageError: the environment has no login for it.
@@ -65,7 +70,12 @@ def guarded_app(names: Iterable[str], *, is_embedded: bool = False) -> ASGIApp:
     app = create_app(ephemeral=is_embedded, final=True)
     gc.freeze()
     gc.enable()
-    return HostGuard(RepeatBusy(app), names)
+    inner: ASGIApp = RepeatBusy(app)
+    if access is not None:
+        from flows.orchestration.dashboard_login import DashboardLogin
+
+        inner = DashboardLogin(inner, access, os.environ[SERVER_LOGIN])
+    return HostGuard(inner, names)
 
 
 def _let_dashboard_be_written() -> None:
@@ -81,12 +91,12 @@ def _let_dashboard_be_written() -> None:
         os.environ.setdefault("PREFECT_SERVER_UI_STATIC_DIRECTORY", str(Path(home) / "ui"))
 
 
-def serve(host: str, port: int, names: Iterable[str]) -> None:
+def serve(host: str, port: int, names: Iterable[str], access: Access | None = None) -> None:
     """Serve API and dashboard until this process receives a signal to end."""
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # each client has several connections
     serve_http(
-        guarded_app({*names, host} - {"0.0.0.0", "::"}),
+        guarded_app({*names, host} - {"0.0.0.0", "::"}, access),
         host=host,
         port=port,
         max_connections=MAX_CONNECTIONS,

@@ -12,6 +12,7 @@ import sys
 import threading
 
 from flows.service.plan import ServePlan
+from flows.web.access import Access, access_for
 from worldpose.errors import WorldposeError
 
 
@@ -37,7 +38,8 @@ def prefect(plan: ServePlan) -> None:
     from flows.orchestration.prefect_server import serve
 
     address = urlsplit(plan.prefect)
-    serve(address.hostname or "127.0.0.1", address.port or 80, ())
+    access = _access(plan, secure=False)  # no TLS: only this machine reaches it
+    serve(address.hostname or "127.0.0.1", address.port or 80, (), access)
 
 
 def worker(plan: ServePlan) -> None:
@@ -62,22 +64,27 @@ def watch(plan: ServePlan) -> None:
 
 def pages(plan: ServePlan) -> None:
     """Serve the review pages and the status page until this process ends."""
-    from flows.web.access import access_for
     from flows.web.app import serve
     from flows.web.intake import Intake
 
-    access = access_for(
-        plan.host,
-        token=os.environ.pop("WORLDPOSE_REVIEW_TOKEN"),  # hide it from runs that pages start
-        names=plan.names,
-        secure=plan.certificate is not None,
-        users=plan.users,
-    )
+    access = _access(plan, secure=plan.certificate is not None)
     tls = None
     if plan.certificate is not None and plan.key is not None:
         tls = (plan.certificate, plan.key)
     intake = Intake(plan.inbox, plan.videos)
     serve(plan.project, access, host=plan.host, port=plan.pages_port, tls=tls, intake=intake)
+
+
+def _access(plan: ServePlan, *, secure: bool) -> Access:
+    """Return what a session opens: the same at the pages and at Prefect's dashboard."""
+    return access_for(
+        plan.host,
+        token=os.environ.pop("WORLDPOSE_REVIEW_TOKEN"),  # hide it from runs that pages start
+        names=plan.names,
+        secure=secure,
+        users=plan.users,
+        ended=plan.state_folder.ended_sessions,
+    )
 
 
 PARTS = {"prefect": prefect, "worker": worker, "watch": watch, "pages": pages}

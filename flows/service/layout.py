@@ -112,6 +112,11 @@ class StateFolder:
         """Token for Prometheus; readable by this user only."""
         return self.folder / "secrets" / "metrics"
 
+    @property
+    def ended_sessions(self) -> Path:
+        """Folder of the sessions after logout, which pages and Prefect's server share."""
+        return self.folder / "secrets" / "ended"
+
     @contextmanager
     def only_one(self, what: str, *, wait: bool) -> Iterator[bool]:
         """Hold the lock `what`; yield whether it was acquired, as `hold_lock`."""

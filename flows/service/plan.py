@@ -108,7 +108,7 @@ class ServePlan(Record):
     schedules: dict[str, Schedule] = Field(default_factory=dict)
     """Flow to its schedule, beside those that people make at the Prefect server."""
     users: Path | None = None
-    """TOML file of the people who may log in to the pages; None: every user with the token."""
+    """TOML file of the people who may log in; None: every user with the token."""
 
     @property
     def state_folder(self) -> StateFolder:
@@ -251,7 +251,8 @@ class Secrets:
             found[SERVER_LOGIN] = self.prefect or ""
         elif self.prefect is not None:
             found[CLIENT_LOGIN] = self.prefect
-        own = {"watch": {METRICS_TOKEN: self.metrics}, "pages": {PAGES_TOKEN: self.pages}}
+        pages = {PAGES_TOKEN: self.pages}
+        own = {"watch": {METRICS_TOKEN: self.metrics}, "pages": pages, "prefect": pages}
         return found | own.get(part, {})
 
 

@@ -101,8 +101,7 @@ class Access:
     """Login token and sessions of the pages.
 
     Sessions are signed with a key derived from the token: they survive a restart of the server with
-    the same token, and all end when it changes. A session after logout is refused until the process
-    ends.
+    the same token, are valid on every server that has it, and all end when it changes.
 
     Attributes:
         token: login token.
@@ -112,6 +111,8 @@ class Access:
         users: people with a role and a token of their own, by name; None = all with the login
             token is an approver.
         proxy: the proxy that logs further people in.
+        ended: folder with a file for each session after logout, which all servers of a service
+            refuse; None = this process alone remembers them.
     """
 
     token: str
@@ -119,6 +120,7 @@ class Access:
     secure: bool = False
     users: Mapping[str, User] | None = None
     proxy: Proxy | None = None
+    ended: Path | None = None
     _ended: dict[str, float] = field(default_factory=dict, init=False, compare=False)
     _wrong: dict[str, tuple[float, float]] = field(default_factory=dict, init=False, compare=False)
     _lock: Lock = field(default_factory=Lock, init=False, compare=False)
@@ -147,19 +149,29 @@ class Access:
         if not self._same(signature, self._sign("session", packed)):
             return None
         content = json.loads(base64.urlsafe_b64decode(packed + "=" * (-len(packed) % 4)))
-        # Also one of an earlier version.
-        if content.get("own") != self._sign_own(content["who"], by_proxy):
+        own = self._sign_own(content["who"], by_proxy)
+        if own is None or content.get("own") != own:  # also one of an earlier version
             return None
         if content["until"] < (time.time() if now is None else now) or signature in self._ended:
+            return None
+        if self.ended is not None and (self.ended / signature).exists():
             return None
         return str(content["who"])
 
     def end(self, session: str) -> None:
         """Refuse a session from now on: its person has logged out."""
+        signature = session.partition(".")[2]
         with self._lock:
-            self._ended[session.partition(".")[2]] = time.time()
+            self._ended[signature] = time.time()
             while len(self._ended) > MOST_REMEMBERED:
                 self._ended.pop(next(iter(self._ended)))
+            if self.ended is None:
+                return
+            self.ended.mkdir(mode=0o700, parents=True, exist_ok=True)
+            (self.ended / signature).touch(0o600)
+            for file in self.ended.iterdir():
+                if file.stat().st_mtime < time.time() - SESSION_SECONDS:  # it has expired, too
+                    file.unlink()
 
     def remember(self, who: str) -> str:
         """Return what a browser keeps after a login: guesses of others do not lock it out."""
@@ -240,12 +252,13 @@ def access_for(
     names: Iterable[str],
     secure: bool,
     users: Path | None = None,
+    ended: Path | None = None,
 ) -> Access:
     """Create the access control of a server that listens at `host`.
 
     Without a token, the server makes and prints a random one. `names` are further names of the
     machine that browsers use, `users` is the file of the people who may log in; None = all with the
-    token.
+    token. `ended` is as in `Access`.
 
     Raises:
         UsageError: the file or the token is not valid, or the server would listen to other
@@ -276,4 +289,5 @@ def access_for(
                 found="none",
                 todo="Add the name, as in --host-name review.example.org.",
             )
-    return Access(token or secrets.token_urlsafe(24), frozenset(hosts), secure, people, proxy)
+    token = token or secrets.token_urlsafe(24)
+    return Access(token, frozenset(hosts), secure, people, proxy, ended)

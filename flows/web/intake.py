@@ -29,14 +29,11 @@ from flows.web.app_context import PageContext, Person
 from flows.web.browser_words import in_browser
 from flows.web.draft_problems import DraftFile
 from flows.web.drafts import Drafts
+from flows.web.guard import CHUNK_SUFFIX
 from flows.web.images import image_response
 from flows.web.video_folders import list_videos, open_video
 from worldpose.errors import InputError
 
-CHUNK_BYTES: Final = 1 << 23
-"""Maximum size of one chunk of an upload [byte]."""
-CHUNK_SUFFIX: Final = "/bytes"
-"""Suffix of the paths that take chunks; all others take JSON."""
 FRAME_PX: Final = 960
 """Maximum width of the frames that a page compares, unless it looks at one close up [px]."""
 OVERTAKEN: Final = "another page saved this form meanwhile: look at it as it is now"

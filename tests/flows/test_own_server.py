@@ -163,12 +163,12 @@ def test_secrets_go_to_the_parts_that_need_them(tmp_path, monkeypatch):
     cloud = {name: value for name, value in given.items() if name.startswith("AWS")}
     region = {"AWS_REGION": "eu"}
     alerts = {name: value for name, value in given.items() if "ALERT" in name}
-    client = {CLIENT_LOGIN: login}
+    client, pages = {CLIENT_LOGIN: login}, {"WORLDPOSE_REVIEW_TOKEN": "pages' token"}
     expected = {
-        "prefect": {SERVER_LOGIN: login, database: given[database]},
+        "prefect": {SERVER_LOGIN: login, database: given[database], **pages},
         "worker": client,
         "watch": {**client, **alerts, METRICS_TOKEN: metrics},
-        "pages": {**client, "WORLDPOSE_REVIEW_TOKEN": "pages' token"},
+        "pages": {**client, **pages},
     }
     assert {part: secrets.of(part, plan) for part in PARTS} == expected
     # Those who read and write the store need its key; the bucket's only who copies from it.

@@ -2,8 +2,10 @@
 
 import json
 import logging
+import os
 import sys
 import threading
+import time
 from pathlib import Path
 
 import page_client
@@ -13,7 +15,8 @@ from page_client import HERE, MATCH, TOKEN, a_click, moved
 
 from flows.cli.options import certificate_and_key
 from flows.web.access import EDITING, SESSION_SECONDS, WRONG_TOKENS, access_for
-from flows.web.app import BODY_BYTES, OPEN, create_app
+from flows.web.app import create_app
+from flows.web.guard import BODY_BYTES, OPEN
 from worldpose.errors import UsageError
 from worldpose.review.journal import read_journal
 from worldpose.store.store import Store
@@ -160,6 +163,26 @@ def test_a_session_that_was_ended_opens_nothing(app, stranger):
     assert stranger.get(MATCH, headers=cookie).status_code == 401
     other = page_client.log_in(app, "Ada")
     assert other.get(MATCH).status_code == 200
+
+
+def test_servers_of_one_service_forget_an_ended_session_only_after_its_expiry(tmp_path):
+    def server():
+        folder = tmp_path / "secrets" / "ended"
+        return access_for("127.0.0.1", token=TOKEN, names=(), secure=False, ended=folder)
+
+    first, second = server(), server()
+    sessions = [first.session("Ada") for _ in range(3)]
+    files = []
+    for number, session in enumerate(sessions):
+        assert second.person(session) == "Ada"
+        first.end(session)
+        for each in (first, second, server()):  # also one that starts later
+            assert each.person(session) is None
+        files += [file for file in second.ended.iterdir() if file not in files]
+        over = time.time() - SESSION_SECONDS + (10.0 if number else -10.0)
+        os.utime(files[number], (over, over))
+    assert set(second.ended.iterdir()) == set(files[1:])
+    assert files[1].stat().st_mode & 0o777 == 0o600
 
 
 def test_guesses_are_limited_for_all_addresses_together_but_not_for_a_known_browser(app, stranger):
@@ -363,6 +386,7 @@ def test_people_of_a_file_may_do_what_their_role_says(project_copy, tmp_path):
     assert vera.get(MATCH).status_code == 200
     # A session ends with the person's entry, or with another token of the person.
     before = access()
+    assert before.person(before.session("Eve")) is None
     session = before.session("Ann")
     assert before.person(session) == "Ann"
     users_file(tmp_path, USERS.replace("of Ann...", "of Ann, new"))

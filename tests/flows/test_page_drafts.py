@@ -19,7 +19,8 @@ from flows.service.layout import served_state
 from flows.web.access import access_for
 from flows.web.app import create_app
 from flows.web.draft_folder import SPARE_BYTES
-from flows.web.intake import CHUNK_BYTES, Intake
+from flows.web.guard import CHUNK_BYTES
+from flows.web.intake import Intake
 from worldpose.ingest.match_folder import read_match
 from worldpose.store.store import Store
 from worldpose.video.files import write_video

@@ -193,11 +193,7 @@ async function schedule() {
   await page.waitForSelector(`text=${task.match}`);
   await shootSizes(page, seen, "status");
   await readHelp();
-  const prefect = await open({ errors: [], outside: seen.outside }, 900);
-  await prefect.goto(`${task.prefect}/deployments`);
-  await prefect.getByPlaceholder("admin:pass").fill(task.login);
-  await prefect.getByRole("button", { name: "Login" }).click();
-  await prefect.waitForTimeout(3000);
+  const prefect = await open({ errors: [], outside: seen.outside }, 900, page.context());
   await prefect.goto(`${task.prefect}/deployments`);
   await prefect.getByRole("row").filter({ hasText: "reprocess" }).getByRole("link").first().click();
   await prefect.waitForURL(/deployment\/[-0-9a-f]+/);

@@ -46,7 +46,6 @@ def test_a_match_of_videos_becomes_results_by_clicks_alone(served, recorded, tmp
         "prefect": f"http://127.0.0.1:{served.ports['prefect']}",
         "pages": f"http://127.0.0.1:{served.ports['pages']}",
         "token": TOKEN,
-        "login": served.secret("prefect"),
         "match": "derby",
         "videos": len(clicks),
         "pitch": str(folder / "pitch.json"),

@@ -1,7 +1,6 @@
 """Other users of the machine, and web pages that an operator visits, get nothing from `serve`."""
 
 import base64
-import http.client
 import json
 import shutil
 import signal
@@ -10,15 +9,16 @@ import time
 import psutil
 import pytest
 from listeners import listening, says_nothing
-from service import TOKEN, Served, wait_until
+from service import TOKEN, Served, request, wait_until
 from websockets.sync.client import connect
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
 ALERT, CLOUD, OTHER = "alert-secret-1", "cloud-secret-2", "another-secret-3"
+FORM = ("/login", "/login/page.js", "/login/page.css")
 OPEN = {
-    "prefect": {"/api/health", "/api/ready"},
-    "pages": {"/api/health", "/login", "/login/page.js", "/login/page.css"},
+    "prefect": {"/api/health", "/api/ready", *FORM},
+    "pages": {"/api/health", *FORM},
     "metrics": {"/health"},
 }
 """What answers without a login: that a server is up, and the form to log in with. The files of
@@ -45,20 +45,6 @@ def pwned(tmp_path):
     """A file that an attack would make, and a shell command that makes it."""
     file = tmp_path / "PWNED"
     return file, f'/bin/sh -c "id > {file}; env >> {file}"'
-
-
-def request(port, method, path, headers=None, body=None):
-    """Status, headers and content of any request at all."""
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
-    given = {"host": f"127.0.0.1:{port}", **(headers or {})}
-    content = None if body is None else json.dumps(body)
-    if body is not None:
-        given.setdefault("content-type", "application/json")
-    connection.request(method, path, content, given)
-    answer = connection.getresponse()
-    found = answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read()
-    connection.close()
-    return found
 
 
 def basic(login):
@@ -310,7 +296,7 @@ def test_nothing_that_listens_answers_a_stranger_also_while_a_match_runs(served,
         ].items()
         if part != "serve"
     }
-    assert parts == {"prefect": set(), "worker": set(), "watch": {ALERT}, "pages": {TOKEN}}
+    assert parts == {"prefect": {TOKEN}, "worker": set(), "watch": {ALERT}, "pages": {TOKEN}}
 
 
 def test_secrets_that_are_kept_are_for_this_user_alone(served):

@@ -3,6 +3,10 @@ const form = document.getElementById("login");
 const message = document.getElementById("message");
 const field = (name) => document.getElementById(name);
 
+// Where the person came from, on this server alone: a link can name any address.
+const asked = new URLSearchParams(location.search).get("next") || "";
+const next = `/${asked.replace(/^[/\\\s]+/, "")}`;
+
 // The token is in the URL fragment, which browsers do not send.
 const given = new URLSearchParams(location.hash.slice(1)).get("token");
 if (given) {
@@ -12,7 +16,7 @@ if (given) {
 field("who").value = localStorage.getItem("who") || "";
 (field("who").value ? field("token") : field("who")).focus();
 
-fetch("/api/session").then((answer) => { if (answer.ok) location.replace("/"); });
+fetch("/api/session").then((answer) => { if (answer.ok) location.replace(next); });
 
 form.addEventListener("submit", async (event) => {
   event.preventDefault();
@@ -32,7 +36,7 @@ form.addEventListener("submit", async (event) => {
     }
     if (answer.ok) {
       localStorage.setItem("who", who);
-      location.replace("/");
+      location.replace(next);
     } else {
       message.textContent = (await answer.json()).error || "That did not work.";
     }

@@ -1,0 +1,111 @@
+"""Prefect's API and dashboard for a browser that has logged in to the pages."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import Final
+from urllib.parse import quote
+
+from starlette.datastructures import Headers
+from starlette.responses import JSONResponse, RedirectResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from flows.orchestration.prefect_environment import authorization
+from flows.web.access import Access
+from flows.web.guard import OPEN, identify
+from flows.web.host_guard import SAFE_METHODS, refusal
+from flows.web.sessions import login_app
+
+FORM: Final = OPEN - {"/api/health"} | {"/api/session"}
+"""Paths of the log-in form; Prefect's own `/login` would ask for its password."""
+CHECK_SECONDS: Final = 1.0
+"""Interval at which the session of an open WebSocket is checked [s]."""
+
+
+class DashboardLogin:
+    """ASGI middleware that gives Prefect's login to requests with the session of an approver.
+
+    Prefect checks the login as before. A session counts only for requests of this server's own
+    pages, which the host guard around this one has told from foreign ones; a change must state its
+    origin. Clients with the login pass unchanged. A browser without either gets the pages' form.
+
+    Args:
+        app: Prefect's server.
+        access: that of the pages.
+        login: Prefect's, as USER:PASSWORD.
+    """
+
+    def __init__(self, app: ASGIApp, access: Access, login: str) -> None:
+        self.app, self.access, self.login = app, access, login
+        self.form = login_app(access)
+        # Without users, a proxy logs people in, and Prefect's own form stays for everyone else.
+        self.form_paths = frozenset[str]() if access.users == {} else FORM
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request."""
+        if scope["type"] not in ("http", "websocket"):
+            await self.app(scope, receive, send)
+            return
+        headers, method = Headers(scope=scope), scope.get("method", "")
+        is_own = "origin" in headers or headers.get("sec-fetch-site") == "same-origin"
+        is_page = method == "GET" and "text/html" in headers.get("accept", "")
+        who, role, _, _ = identify(self.access, scope, headers)
+        if method and scope["path"] in self.form_paths:
+            await self.form(scope, receive, send)
+        elif who is not None and role == "approver" and (is_own or method in SAFE_METHODS):
+            await (self._ask if method else self._stream)(scope, receive, send)
+        elif not is_page or "authorization" in headers or not (who or self.form_paths):
+            await self.app(scope, receive, send)
+        elif who is not None:
+            refused = refusal(403, f"the role of {who}, {role}, does not allow this")
+            await refused(scope, receive, send)
+        else:
+            asked = quote(f"{scope['path']}?{scope['query_string'].decode('latin-1')}", safe="/")
+            await RedirectResponse(f"/login?next={asked}", status_code=303)(scope, receive, send)
+
+    async def _ask(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on with the login; the dashboard's settings then name no login."""
+        is_settings = scope["path"] == "/ui-settings"
+        dropped = (b"authorization", *[b"accept-encoding"] * is_settings)
+        headers = [each for each in scope["headers"] if each[0] not in dropped]
+        headers.append((b"authorization", authorization(self.login).encode()))
+        body = b""
+
+        async def collect(message: Message) -> None:
+            nonlocal body
+            body += message.get("body", b"")
+
+        answered = collect if is_settings else send
+        await self.app({**scope, "headers": headers}, receive, answered)
+        if is_settings:
+            without = {**json.loads(body), "auth": None}  # the dashboard would ask for the login
+            answer = JSONResponse(without, headers={"cache-control": "no-store"})
+            await answer(scope, receive, send)
+
+    async def _stream(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a WebSocket on, with the login in its first message, while the session lasts."""
+        is_first = True
+
+        async def read() -> Message:
+            nonlocal is_first
+            message = await receive()
+            if message["type"] == "websocket.receive" and is_first:
+                is_first = False
+                said = json.loads(message.get("text") or "null")
+                if isinstance(said, dict) and said.get("type") == "auth":
+                    message = {**message, "text": json.dumps({**said, "token": self.login})}
+            return message
+
+        stream = asyncio.ensure_future(self.app(scope, read, send))
+        try:
+            while not (await asyncio.wait({stream}, timeout=CHECK_SECONDS))[0]:
+                who, role, _, _ = identify(self.access, scope, Headers(scope=scope))
+                if who is None or role != "approver":
+                    stream.cancel()
+                    await asyncio.wait({stream})
+                    await send({"type": "websocket.close", "code": 1008})
+                    return
+            await stream
+        finally:
+            stream.cancel()
