@@ -199,9 +199,9 @@ def find_changes(
 
 
 def _exported_name(given: str, known: dict[str, AnnotatedImage]) -> str | None:
-    """Return the exported image's name for an annotator's name."""
-    name = PurePosixPath(given.replace("\\", "/")).name
-    return next((each for each in known if name == each or name.endswith(f"-{each}")), None)
+    """Return the exported image's name for an annotator's name; a camera's id can have a `-`."""
+    name = "-" + PurePosixPath(given.replace("\\", "/")).name
+    return max((each for each in known if name.endswith(f"-{each}")), key=len, default=None)
 
 
 def _list_moved(at: dict[str, object], before: Floats, now: Floats) -> list[MovedKeypoint]:

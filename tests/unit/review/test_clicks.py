@@ -232,6 +232,17 @@ def test_what_only_was_rounded_is_no_change(name):
     assert find_changes(BEFORE, [], "file").edits == ()  # a picture that did not come back
 
 
+@pytest.mark.parametrize("prefix", ["", "pictures/", "f00-"])
+def test_a_picture_is_of_the_camera_whose_whole_name_it_has(prefix):
+    names = [image_name(camera, 120) for camera in ("1", "north-1", "west")]
+    before = [picture(person(0), name=name) for name in names]
+    for camera, name in zip(("1", "north-1", "west"), names, strict=True):
+        (edit,) = find_changes(before, [picture(name=prefix + name)], "file").edits
+        assert edit.camera == camera
+    back = [picture(person(0), name=prefix + name) for name in reversed(names)]
+    assert find_changes(before, back, "file").edits == ()
+
+
 def test_moved_hidden_found_added_and_deleted_are_told_apart():
     changed = person(7)
     changed.keypoints[0] = (5.0, 6.0)
