@@ -45,9 +45,8 @@ def identities_now(store: Store, match: Match, clip: str) -> IdentityReplay:
     require_results([name] if name in results else [], f"clip {clip}", "tracks", match_id)
     stored = open_stored(store, store.run(match_id), name, "identities")
     moves = [edit for edit in said if isinstance(edit, TRACK_EDITS)]
-    later = edits_since(moves, stored.edits, f"clip {clip}", match_id)
-    stated = _stated_names(store, match_id, clip)
-    return _replay(stored, said, moves[: len(moves) - len(later)], stated)
+    edits_since(moves, stored.edits, f"clip {clip}", match_id)
+    return _replay(stored, said, _stated_names(store, match_id, clip))
 
 
 def names_said(match: Match) -> str:
@@ -115,10 +114,7 @@ def _replay_names(run: Run, clip: str) -> tuple[dict[str, str], dict[int, str]]:
         if name in journal.standing if is_name else edit.model_dump(mode="json") in moves:
             said[name] = edit
     stored = open_stored(run.store, run.record, unit, "identities")
-    moved = [edit for edit in said.values() if isinstance(edit, TRACK_EDITS)]
-    edits = list(said.values())
-    taken = moved if stored.edits else []
-    replay = _replay(stored, edits, taken, stated, with_joints=False)
+    replay = _replay(stored, [*said.values()], stated, with_joints=False)
     ids, names = replay.identities.person.tolist(), replay.identities.names
     lost |= {
         name: f"{edit.name!r} names no person: {why}. Name the person again, or withdraw the name"
@@ -150,33 +146,34 @@ def _lost_stated(
 def _replay(
     stored: StoredResult,
     said: Sequence[IdentityEdit],
-    taken: Sequence[IdentityEdit],
     stated: Mapping[int, str],
     *,
     with_joints: bool = True,
 ) -> IdentityReplay:
-    """Replay corrections over a result that contains the merges and splits `taken` already.
+    """Replay corrections over a result, which can contain the first merges and splits already.
 
     People whom no correction names, or leaves without a name, have the names `stated`. The
     objections are in the order of `said`.
     """
     merged, others = dict[int, IdentityEdit](), dict[int, IdentityEdit]()
+    moves = (number for number, edit in enumerate(said) if isinstance(edit, TRACK_EDITS))
+    taken = dict(zip(moves, stored.result.attrs["objections"], strict=False))
     for number, edit in enumerate(said):
         if isinstance(edit, NamedTrack):
             person, seen = edit.person, edit.seen
-            for move in said[number + 1 :]:
-                if move in taken and isinstance(move, MergedTracks) and move.merged == person:
+            for move in (said[n] for n, why in taken.items() if n > number and why is None):
+                if isinstance(move, MergedTracks) and move.merged == person:
                     person = move.kept
-                elif move in taken and isinstance(move, SplitTrack) and move.person == person:
+                elif isinstance(move, SplitTrack) and move.person == person:
                     seen = None  # it can belong to the new person, and the name does not
             after = edit.model_copy(update={"person": person, "seen": seen})
             (others if person == edit.person else merged)[number] = after
-        elif edit not in taken:
+        elif number not in taken:
             others[number] = edit
     tracks = stored_identities(stored.result, with_joints=with_joints)
     order = merged | others  # a person's own name counts more
     replay = replay_identities(tracks, order.values())
-    found = dict(zip(order, replay.objections, strict=True))
+    found = taken | dict(zip(order, replay.objections, strict=True))
     gone = {move.merged: at for at, move in enumerate(said) if isinstance(move, MergedTracks)}
     nameless = {
         edit.person
