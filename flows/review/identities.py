@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
+from pydantic import JsonValue
+
 from data_contracts.review import Edit, MergedTracks, NamedTrack, SplitTrack
 from flows.review.edit_conflicts import (
     StaleEditError,
@@ -24,7 +26,7 @@ from worldpose.review.identities import (
     replay_identities,
     stored_identities,
 )
-from worldpose.review.journal import read_journal
+from worldpose.review.journal import Journal, read_journal
 from worldpose.store.store import Run, Store
 
 
@@ -105,14 +107,7 @@ def _replay_names(run: Run, clip: str) -> tuple[dict[str, str], dict[int, str]]:
         return lost, {}
     moves = run.manifest(unit).recipe.sources.get("identities") or []
     assert isinstance(moves, list)
-    said: dict[str, IdentityEdit] = {}
-    for name, each in journal.corrections.items():
-        edit = each.edit
-        if not isinstance(edit, IDENTITY_EDITS) or edit.clip != clip:
-            continue
-        is_name = isinstance(edit, NamedTrack)
-        if name in journal.standing if is_name else edit.model_dump(mode="json") in moves:
-            said[name] = edit
+    said = _said_in(journal, clip, moves)
     stored = open_stored(run.store, run.record, unit, "identities")
     replay = _replay(stored, [*said.values()], stated, with_joints=False)
     ids, names = replay.identities.person.tolist(), replay.identities.names
@@ -122,6 +117,29 @@ def _replay_names(run: Run, clip: str) -> tuple[dict[str, str], dict[int, str]]:
         if isinstance(edit, NamedTrack) and edit.name and why and edit.name not in names.values()
     }
     return lost | _lost_stated(clip, stated, ids, names), names
+
+
+def _said_in(journal: Journal, clip: str, moves: Sequence[JsonValue]) -> dict[str, IdentityEdit]:
+    """Return the names in force and the merges and splits of a result, in order, by correction.
+
+    Corrections can be equal: those of a result are the first in force, or the newest that fit if
+    some were withdrawn since.
+    """
+    own: dict[str, IdentityEdit] = {}
+    for name, each in journal.corrections.items():
+        if isinstance(each.edit, IDENTITY_EDITS) and each.edit.clip == clip:
+            own[name] = each.edit
+    as_json = {name: edit.model_dump(mode="json") for name, edit in own.items()}
+    names = {name for name, edit in own.items() if isinstance(edit, NamedTrack)}
+    taken = [name for name in journal.standing if name in own.keys() - names][: len(moves)]
+    if [as_json[name] for name in taken] != moves:
+        taken, left = [], [*moves]
+        for name in reversed(own):
+            if left and as_json[name] == left[-1]:
+                taken.append(name)
+                left.pop()
+    kept = {*taken, *(names & journal.standing.keys())}
+    return {name: edit for name, edit in own.items() if name in kept}
 
 
 def _stated_names(store: Store, match_id: str, clip: str) -> dict[int, str]:

@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 import xarray as xr
+from run_records import correction
 
 from data_contracts.review import MergedTracks, NamedTrack, SplitTrack
 from flows.review import identities
 from flows.review.edit_conflicts import StoredResult
 from worldpose.review.identities import replay_identities, stored_identities
+from worldpose.review.journal import Journal
 
 FRAMES = 12
 
@@ -59,3 +61,33 @@ def test_an_edit_made_twice_is_replayed_twice_whatever_the_tracks_contain(taken)
     assert np.array_equal(found.identities.detection_index, whole.detection_index)
     assert found.identities.names == whole.names == {0: "Bo", 3: "Al"}
     assert [bool(why) for why in found.objections] == [False, False, False, False, True, False]
+
+
+def journal(said, withdrawn=()):
+    """A journal of corrections by id, some of which were withdrawn."""
+    made = {name: correction(edit, name) for name, edit in said.items()}
+    standing = {name: each for name, each in made.items() if name not in withdrawn}
+    return Journal("m", corrections=made, standing=standing)
+
+
+SPLITS = {"a": split(0, 6), "b": split(1, 6), "c": split(0, 6), "n": named(4, "Al")}
+ANEW = {"a": split(0, 6), "n": named(3, "Al"), "b": merge(0, 3), "c": split(0, 6)}
+
+
+@pytest.mark.parametrize(
+    ("said", "withdrawn", "taken", "used"),
+    [
+        (SPLITS, "a", "bc", "bcn"),
+        (SPLITS, "", "ab", "abn"),  # a run before the last split
+        (SPLITS, "ac", "bc", "bcn"),  # an older run
+        (SPLITS, "an", "bc", "bc"),
+        (ANEW, "", "a", "an"),  # in force: the split before the name, and not the later one
+        (ANEW, "", "abc", "anbc"),
+        (ANEW, "b", "abc", "anbc"),
+    ],
+)
+def test_of_equal_corrections_a_result_has_each_once(said, withdrawn, taken, used):
+    moves = [said[name].model_dump(mode="json") for name in taken]
+    found = identities._said_in(journal(said, withdrawn), "clip", moves)
+    assert [*found] == [*used]
+    assert identities._said_in(journal(said, withdrawn), "other", []) == {}
