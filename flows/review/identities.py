@@ -116,7 +116,8 @@ def _replay_names(run: Run, clip: str) -> tuple[dict[str, str], dict[int, str]]:
         for (name, edit), why in zip(said.items(), replay.objections, strict=True)
         if isinstance(edit, NamedTrack) and edit.name and why and edit.name not in names.values()
     }
-    return lost | _lost_stated(clip, stated, ids, names), names
+    gone = _merged_away([*said.values()], replay.objections)
+    return lost | _lost_stated(clip, stated, {*ids} - gone, names), names
 
 
 def _said_in(journal: Journal, clip: str, moves: Sequence[JsonValue]) -> dict[str, IdentityEdit]:
@@ -155,7 +156,8 @@ def _lost_stated(
     """Return why names of match.yaml fit no person, by clip and person."""
     return {
         f"{clip}/{person}": f"{name!r} in match.yaml names no person: clip {clip} has no person "
-        f"{person}. Correct the clip's `people`"
+        f"{person} that no merge removed. Correct the clip's `people`, or name the person by a "
+        "correction"
         for person, name in stated.items()
         if person not in ids and name not in names.values()
     }
@@ -170,8 +172,8 @@ def _replay(
 ) -> IdentityReplay:
     """Replay corrections over a result, which can contain the first merges and splits already.
 
-    People whom no correction names, or leaves without a name, have the names `stated`. The
-    objections are in the order of `said`.
+    People whom no correction names, or leaves without a name, have the names `stated`, unless a
+    merge removed their id. The objections are in the order of `said`.
     """
     merged, others = dict[int, IdentityEdit](), dict[int, IdentityEdit]()
     moves = (number for number, edit in enumerate(said) if isinstance(edit, TRACK_EDITS))
@@ -192,19 +194,21 @@ def _replay(
     order = merged | others  # a person's own name counts more
     replay = replay_identities(tracks, order.values())
     found = taken | dict(zip(order, replay.objections, strict=True))
-    gone = {move.merged: at for at, move in enumerate(said) if isinstance(move, MergedTracks)}
-    nameless = {
+    objections = tuple(found.get(number) for number in range(len(said)))
+    nameless = _merged_away(said, objections) | {
         edit.person
         for number, edit in others.items()
         if isinstance(edit, NamedTrack) and edit.name is None and found[number] is None
-        if gone.get(edit.person, -1) < number  # later a split can give the id to another person
     }
     now = replay.identities
     left = {who: name for who, name in stated.items() if who in now.person and who not in nameless}
-    return IdentityReplay(
-        replace(now, names=left | now.names),
-        tuple(found.get(number) for number in range(len(said))),
-    )
+    return IdentityReplay(replace(now, names=left | now.names), objections)
+
+
+def _merged_away(said: Sequence[IdentityEdit], objections: Sequence[str | None]) -> set[int]:
+    """Return the ids that merges removed; later a split can give them to other people."""
+    edits = zip(said, objections, strict=True)
+    return {edit.merged for edit, why in edits if isinstance(edit, MergedTracks) and why is None}
 
 
 def require_fitting(store: Store, match: Match, edits: Sequence[Edit]) -> None:
