@@ -116,7 +116,7 @@ def new_corrections(
             todo="Read them with `worldpose review show`, and repeat the correction.",
         )
     if results:  # before the first run there is nothing to compare with: the run tells
-        require_fitting(store, match, edits)
+        edits = require_fitting(store, match, edits)
         require_seen(store, match, edits)
     folder, said = match.folder, []
     for number, given in enumerate(edits):

@@ -23,6 +23,7 @@ from worldpose.review.identities import (
     IdentityEdit,
     IdentityReplay,
     find_objection,
+    find_sighting,
     replay_identities,
     stored_identities,
 )
@@ -211,14 +212,17 @@ def _merged_away(said: Sequence[IdentityEdit], objections: Sequence[str | None])
     return {edit.merged for edit, why in edits if isinstance(edit, MergedTracks) and why is None}
 
 
-def require_fitting(store: Store, match: Match, edits: Sequence[Edit]) -> None:
-    """Refuse identity corrections that do not fit the current tracks.
+def require_fitting(store: Store, match: Match, edits: Sequence[Edit]) -> list[Edit]:
+    """Return edits, those of identities with sightings of their people in the current tracks.
+
+    So an edit does not apply to whom other tracks give the id.
 
     Raises:
         StaleEditError: another person changed the identities, or the edit never fitted.
     """
     found: dict[str, Identities] = {}
-    for edit in edits:
+    seen = list(edits)
+    for number, edit in enumerate(edits):
         if not isinstance(edit, IDENTITY_EDITS):
             continue
         if edit.clip not in found:
@@ -231,4 +235,17 @@ def require_fitting(store: Store, match: Match, edits: Sequence[Edit]) -> None:
                 clip=edit.clip,
                 kind=edit.kind,
             )
+        seen[number] = _add_sightings(found[edit.clip], edit)
         found[edit.clip] = replay_identities(found[edit.clip], [edit]).identities
+    return seen
+
+
+def _add_sightings(found: Identities, edit: IdentityEdit) -> IdentityEdit:
+    """Return an edit that applies to `found`, with sightings of its people where it has none."""
+    people = {"seen": "person", "kept_seen": "kept", "merged_seen": "merged"}
+    update = {
+        seen: find_sighting(found, getattr(edit, person))
+        for seen, person in people.items()
+        if hasattr(edit, person) and getattr(edit, seen) is None
+    }
+    return edit.model_copy(update=update)

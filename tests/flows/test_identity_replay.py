@@ -1,14 +1,16 @@
 """Corrections of identities over stored tracks, with and without those before the corrections."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import xarray as xr
 from run_records import correction
 
-from data_contracts.review import MergedTracks, NamedTrack, SplitTrack
+from data_contracts.review import MergedTracks, MovedPoint, NamedTrack, SplitTrack
 from flows.review import identities
 from flows.review.edit_conflicts import StoredResult
-from worldpose.review.identities import replay_identities, stored_identities
+from worldpose.review.identities import IdentityReplay, replay_identities, stored_identities
 from worldpose.review.journal import Journal
 
 FRAMES = 12
@@ -61,6 +63,36 @@ def test_an_edit_made_twice_is_replayed_twice_whatever_the_tracks_contain(taken)
     assert np.array_equal(found.identities.detection_index, whole.detection_index)
     assert found.identities.names == whole.names == {0: "Bo", 3: "Al"}
     assert [bool(why) for why in found.objections] == [False, False, False, False, True, False]
+
+
+@pytest.mark.parametrize("taken", range(5))
+def test_a_name_of_the_match_folder_is_not_that_of_who_gets_the_id_later(taken):
+    stated = {1: "bea", 2: "cleo", 3: "dora"}
+    said = [split(2, 6), merge(2, 3), merge(1, 9), split(1, 6)]
+    after = replay(said, taken, stated)
+    found, gone = after.identities, identities._merged_away(said, after.objections)
+    assert (found.person.tolist(), found.names) == ([0, 1, 2, 3], {1: "bea", 2: "cleo"})
+    (why,) = identities._lost_stated("clip", stated, {0, 1, 2, 3} - gone, found.names).values()
+    assert "'dora' in match.yaml names no person: clip clip has no person 3 that no merge" in why
+    # A split alone, and merges that do not apply, take no name away.
+    refused = [split(1, 6), merge(0, 2), merge(9, 3)]
+    assert replay(refused, min(taken, 3), stated).identities.names == stated
+
+
+@pytest.mark.parametrize("edit", [merge(0, 3), split(2, 6), named(2, "x")])
+def test_an_edit_is_kept_with_sightings_and_applies_to_no_other_person_of_the_id(edit, monkeypatch):
+    found = replay([split(0, 6)]).identities
+    monkeypatch.setattr(identities, "identities_now", lambda *_: IdentityReplay(found, ()))
+    click = MovedPoint(camera="a", marking="corner", xy=None)
+    full, kept_click = identities.require_fitting(None, None, [edit, click])
+    assert (edit != full, kept_click) == (True, click)
+    assert replay_identities(found, [full]).objections == (None,)
+    other = replace(
+        found, detection_index=np.where(found.detection_index < 0, -1, found.detection_index + 5)
+    )
+    assert replay_identities(other, [edit]).objections == (None,)
+    (why,) = replay_identities(other, [full]).objections
+    assert "is not the person that was seen" in why
 
 
 def journal(said, withdrawn=()):
