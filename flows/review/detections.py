@@ -95,6 +95,28 @@ def detection_objections(run: Run, name: str) -> tuple[str | None, ...]:
     return replay_detections(found, said).objections
 
 
+def replay_objections(store: Store, match: Match, camera: str) -> list[str | None]:
+    """Return why each of a camera's corrections does not apply to the detections that pages show.
+
+    Those that the latest run contains count as applied, if it has no result without them.
+
+    Raises:
+        InputError: as `detections_now`.
+    """
+    said = edits_by_camera(match).get(camera, [])
+    objections: list[str | None] = [None] * len(said)
+    for name in results_of(store, match, camera):
+        stored = _open(store, match, name)
+        frame = stored.result["frame"].values
+        own = [n for n, each in enumerate(said) if each.frame in range(frame[0], frame[-1] + 1)]
+        later = edits_since([said[n] for n in own], stored.edits, camera, match.match_id)
+        edited = stored.result.isel(frame=np.isin(frame, [edit.frame for edit in later]))
+        replay = replay_detections(KeypointDetections.from_arrays(edited), later)
+        for n, why in zip(own[len(own) - len(later) :], replay.objections, strict=True):
+            objections[n] = why
+    return objections
+
+
 def _open(store: Store, match: Match, name: str) -> StoredResult:
     return open_stored(store, store.run(match.match_id), name, "edits")
 

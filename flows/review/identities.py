@@ -31,7 +31,9 @@ from worldpose.review.journal import Journal, read_journal
 from worldpose.store.store import Run, Store
 
 
-def identities_now(store: Store, match: Match, clip: str) -> IdentityReplay:
+def identities_now(
+    store: Store, match: Match, clip: str, *, with_joints: bool = True
+) -> IdentityReplay:
     """Return the tracks of a clip with all corrections, including those no run contains yet.
 
     Raises:
@@ -49,7 +51,8 @@ def identities_now(store: Store, match: Match, clip: str) -> IdentityReplay:
     stored = open_stored(store, store.run(match_id), name, "identities")
     moves = [edit for edit in said if isinstance(edit, TRACK_EDITS)]
     edits_since(moves, stored.edits, f"clip {clip}", match_id)
-    return _replay(stored, said, _stated_names(store, match_id, clip))
+    stated = _stated_names(store, match_id, clip)
+    return _replay(stored, said, stated, with_joints=with_joints)
 
 
 def names_said(match: Match) -> str:
