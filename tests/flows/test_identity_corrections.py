@@ -247,7 +247,7 @@ def test_every_door_refuses_what_does_not_fit_the_results(store):
     assert read_journal(store, TINY).entries == ()
 
 
-def test_what_a_run_refused_is_told_so_and_what_no_run_has_yet(store):
+def test_what_a_run_refused_is_told_so_and_what_no_run_has_yet(store, tmp_path):
     edits = {
         "out": DeletedDetection(camera="cam01", frame=5, detection=77),
         "one": MergedTracks(clip="clip", kept=0, merged=88),
@@ -268,7 +268,13 @@ def test_what_a_run_refused_is_told_so_and_what_no_run_has_yet(store):
 
     match, until = open_match(store, TINY), selected_stages(None, "tracking")
     record = RunLog.begin(store, match, until, {}).run_stages(compute_units)
+    told = objections_of(Run(store, record))
+    # As after a garbage collection.
+    plain = ResultId(TINY, "ingest", "cam01", store.run(TINY, "0001").results["ingest/cam01"])
+    (store.blobs.root / plain.path).rename(tmp_path / "plain")
     found = objections_of(Run(store, record))
+    (tmp_path / "plain").rename(store.blobs.root / plain.path)
+    assert found == told
     assert "there is no detection 77" in found["out"] and "no person 88" in found["one"]
     assert not {"corrected"} & {*origins_of(store, open_match(store, TINY), record).values()}
     deleted = DeletedDetection(camera="cam01", frame=5, detection=0)
