@@ -30,9 +30,10 @@ DETECTION = GroupLayout(
     attributes={
         "camera_id": "camera of the match, or broadcast view",
         "unreadable": "[first, last] match frame of each interval without an image",
+        "objections": "for each correction, in order: why it does not apply; absent without any",
         **POINT_ATTRIBUTE,
     },
-    optional=OPTIONAL_POINTS,
+    optional=("objections", *OPTIONAL_POINTS),
 )
 
 

@@ -35,7 +35,11 @@ INGEST = GroupLayout(
         "video": "null, or a video's time_base [1, units per second], size [px], missing_frames, "
         "and is_counted if frames are known only by counting from the first",
         "left_out": "why the video cannot be read; null if it can",
+        "objections": "for each correction, in order: why it does not apply; absent without any",
         **POINT_ATTRIBUTE,
     },
-    optional=(*(array.name for array in (*KEYPOINT_ARRAYS, *VIDEO_ARRAYS)), *OPTIONAL_POINTS),
+    optional=(
+        *(array.name for array in (*KEYPOINT_ARRAYS, *VIDEO_ARRAYS)),
+        *("objections", *OPTIONAL_POINTS),
+    ),
 )

@@ -304,8 +304,8 @@ class Gatekeeper:
     def _is_known(self, gate: Gate, name: str, manifest: ResultManifest) -> bool:
         """Return whether people approved the same metrics of an earlier result of this unit.
 
-        A metric that got no worse is the same question. Counts, whose limit is zero, can be of
-        other things, and are asked about again.
+        A metric is the same question if it and its parts beyond the limit, such as cameras, got no
+        worse. Counts, whose limit is zero, can be of other things, and are asked about again.
         """
         journal = self.match.journal
         asked = requests_by_id(journal.questions)
@@ -323,9 +323,12 @@ class Gatekeeper:
         now = gate.judged(manifest.figures)
         return all(
             gate.limits[metric] > 0.0
-            and metric in before
             and metric in now
-            and not exceeds(now[metric], before[metric])
+            and all(
+                part in before and not exceeds(value, before[part])
+                for part, value in now.items()
+                if part.partition(".")[0] == metric and exceeds(value, gate.limits[metric])
+            )
             for metric in gate.objections(manifest.figures)
         )
 

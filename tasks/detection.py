@@ -43,10 +43,10 @@ def detection(inputs: UnitInputs, result: ResultWriter) -> None:
         found = found or _detect_people(inputs, spool)
         result.figures |= found.figures | _longest_gap(found.unreadable)
         result.warnings += found.warnings
-        detections = found.detections
+        detections, objections = found.detections, {}
         if edits:
             replay = replay_detections(detections, edits)
-            detections = replay.observations
+            detections, objections = replay.observations, {"objections": [*replay.objections]}
             result.figures["corrections_refused"] = float(sum(map(bool, replay.objections)))
         result.write(
             DETECTION,
@@ -55,6 +55,7 @@ def detection(inputs: UnitInputs, result: ResultWriter) -> None:
             attributes={
                 "camera_id": inputs.sources["camera"],
                 "unreadable": found.unreadable,
+                **objections,
                 **detections.labels(),
             },
         )

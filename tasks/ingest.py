@@ -35,10 +35,11 @@ def _write_observations(inputs: UnitInputs, result: ResultWriter) -> None:
     result.warnings += describe_changes({inputs.unit: read})
     observations = _unit_frames(inputs).place(file, read.people)
     inputs.require_registered("detections")
+    objections = {}
     if "edits" in sources:
         edits = TypeAdapter(list[DetectionEdit]).validate_python(sources["edits"])
         replay = replay_detections(observations, edits)
-        observations = replay.observations
+        observations, objections = replay.observations, {"objections": [*replay.objections]}
         result.figures["corrections_refused"] = float(sum(map(bool, replay.objections)))
     result.write(
         INGEST,
@@ -48,6 +49,7 @@ def _write_observations(inputs: UnitInputs, result: ResultWriter) -> None:
             "camera_id": inputs.unit,
             "video": None,
             "left_out": None,
+            **objections,
             **observations.labels(),
         },
     )

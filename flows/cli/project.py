@@ -194,7 +194,7 @@ def gc(
 
     Options:
         delete: Remove the listed items; without it, only list them.
-        keep_last: Also forget all but the last N runs of each match, and its last complete one.
+        keep_last: Also forget all but the last N runs of each match, and the last of each stage.
         forget: Also forget this run.
         older_than: Keep results and files of no run that are younger than this [h].
     """

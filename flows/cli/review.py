@@ -17,7 +17,7 @@ from flows.orchestration.prefect_environment import has_server
 from flows.registering import find_registration, open_for_review, open_match
 from flows.review import verdicts
 from flows.review.annotation_exchange import export_people, import_people
-from flows.review.corrections import objections_of
+from flows.review.corrections import objections_now
 from flows.review.descriptions import describe_corrections, in_words, review_json, when
 from flows.review.metric_words import metric_words, reason_words
 from flows.review.verdicts import Review, reviews_of
@@ -100,7 +100,7 @@ def show(
         _print_review(known[request])
         return
     origins = verdicts.origins_of(store, opened, latest) if latest else {}
-    refused = objections_of(Run(store, latest)) if latest else {}
+    refused = objections_now(store, opened, latest)
     contained = verdicts.corrections_in(Run(store, latest), opened) if latest else []
     states = {each.id: "not in a run yet" for each in opened.corrections}
     states |= {each.id: "applied" for each in contained}

@@ -8,11 +8,12 @@ from datetime import UTC, datetime
 from weakref import WeakKeyDictionary
 
 from data_contracts.match import Registration
-from data_contracts.review import Correction, Edit, MovedPoint, RedrawnMarking
+from data_contracts.review import Correction, Edit, MovedPoint, NamedTrack, RedrawnMarking
+from data_contracts.run import RunRecord
 from flows.layers import add_venue, read_layers
-from flows.review.detections import detection_objections, require_seen
+from flows.review.detections import replay_objections, require_seen
 from flows.review.edit_conflicts import StaleEditError
-from flows.review.identities import lost_names, require_fitting
+from flows.review.identities import identities_now, lost_names, require_fitting
 from flows.stage import Match
 from worldpose.errors import InputError
 from worldpose.ingest.match_folder import MatchFolder
@@ -72,17 +73,38 @@ def objections_of(run: Run) -> dict[str, str]:
         place = (run.record.match_id, *unit.split("/", 1), run.record.results[unit])
         if not run.store.has(*place):  # withdrawn
             continue
-        if unit.startswith("tracking/"):
-            taken = run.manifest(unit).recipe.sources["identities"]
-            objections = run[unit].attrs["objections"]
-        else:
-            taken = run.manifest(unit).recipe.sources["edits"]
-            objections = detection_objections(run, unit)
+        sources = run.manifest(unit).recipe.sources
+        taken = sources.get("identities") or sources["edits"]
         assert isinstance(taken, list)  # corrections as JSON
+        unknown = "the result does not tell whether it applies: run the match again"  # an older one
+        objections = run[unit].attrs.get("objections", [unknown] * len(taken))
         for edit, why in zip(taken, objections, strict=True):
             name = next((it for it in said if said[it] == edit), "")
             said.pop(name, None)  # of two that are equal, the second can be refused
             found |= {name: why} if name and why else {}
+    return found
+
+
+def objections_now(store: Store, match: Match, latest: RunRecord | None) -> dict[str, str]:
+    """Return why corrections in force do not apply to the latest run, or to what pages show."""
+    found = {} if latest is None else objections_of(Run(store, latest))
+    replayed: dict[tuple[str, bool], list[Correction]] = {}
+    for each in match.corrections:
+        if isinstance(each.edit, (*IDENTITY_EDITS, *DETECTION_EDITS)):
+            key = owner_of(each.edit), isinstance(each.edit, IDENTITY_EDITS)
+            replayed.setdefault(key, []).append(each)
+    for (owner, is_clip), made in replayed.items():
+        try:
+            objections: Sequence[str | None]
+            if is_clip:
+                objections = identities_now(store, match, owner, with_joints=False).objections
+            else:
+                objections = replay_objections(store, match, owner)
+        except InputError:  # nothing is replayed before the next run, and pages say why
+            continue
+        for each, why in zip(made, objections, strict=True):
+            if why and not isinstance(each.edit, NamedTrack):  # a name can be given again
+                found[each.id] = why
     return found
 
 
@@ -116,7 +138,7 @@ def new_corrections(
             todo="Read them with `worldpose review show`, and repeat the correction.",
         )
     if results:  # before the first run there is nothing to compare with: the run tells
-        require_fitting(store, match, edits)
+        edits = require_fitting(store, match, edits)
         require_seen(store, match, edits)
     folder, said = match.folder, []
     for number, given in enumerate(edits):

@@ -8,7 +8,6 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 import numpy as np
-from pydantic import TypeAdapter
 
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.review import Acceptance, Edit
@@ -25,12 +24,11 @@ from flows.stages.ingest import edits_by_camera
 from worldpose.errors import InputError
 from worldpose.review.detections import (
     DETECTION_EDITS,
-    DetectionEdit,
     find_objection,
     replay_detections,
 )
 from worldpose.review.journal import say
-from worldpose.store.store import Run, Store
+from worldpose.store.store import Store
 
 if TYPE_CHECKING:
     from worldpose.review.evidence import OpenDetections
@@ -79,20 +77,26 @@ def require_seen(store: Store, match: Match, edits: Sequence[Edit]) -> None:
         found[place] = replay_detections(found[place], [edit]).observations
 
 
-def detection_objections(run: Run, name: str) -> tuple[str | None, ...]:
-    """Return why each correction in a result with detections does not apply; None if it does.
+def replay_objections(store: Store, match: Match, camera: str) -> list[str | None]:
+    """Return why each of a camera's corrections does not apply to the detections that pages show.
 
-    Without the result before the corrections, nothing is said of the single ones.
+    Those that the latest run contains count as applied, if it has no result without them.
+
+    Raises:
+        InputError: as `detections_now`.
     """
-    said = TypeAdapter(list[DetectionEdit]).validate_python(
-        run.manifest(name).recipe.sources["edits"]
-    )
-    stored = open_stored(run.store, run.record, name, "edits")
-    if stored.edits:
-        return (None,) * len(said)
-    edited = np.isin(stored.result["frame"].values, [edit.frame for edit in said])
-    found = KeypointDetections.from_arrays(stored.result.isel(frame=edited))  # all can be many
-    return replay_detections(found, said).objections
+    said = edits_by_camera(match).get(camera, [])
+    objections: list[str | None] = [None] * len(said)
+    for name in results_of(store, match, camera):
+        stored = _open(store, match, name)
+        frame = stored.result["frame"].values
+        own = [n for n, each in enumerate(said) if each.frame in range(frame[0], frame[-1] + 1)]
+        later = edits_since([said[n] for n in own], stored.edits, camera, match.match_id)
+        edited = stored.result.isel(frame=np.isin(frame, [edit.frame for edit in later]))
+        replay = replay_detections(KeypointDetections.from_arrays(edited), later)
+        for n, why in zip(own[len(own) - len(later) :], replay.objections, strict=True):
+            objections[n] = why
+    return objections
 
 
 def _open(store: Store, match: Match, name: str) -> StoredResult:

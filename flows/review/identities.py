@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
+from pydantic import JsonValue
+
 from data_contracts.review import Edit, MergedTracks, NamedTrack, SplitTrack
 from flows.review.edit_conflicts import (
     StaleEditError,
@@ -21,14 +23,17 @@ from worldpose.review.identities import (
     IdentityEdit,
     IdentityReplay,
     find_objection,
+    find_sighting,
     replay_identities,
     stored_identities,
 )
-from worldpose.review.journal import read_journal
+from worldpose.review.journal import Journal, read_journal
 from worldpose.store.store import Run, Store
 
 
-def identities_now(store: Store, match: Match, clip: str) -> IdentityReplay:
+def identities_now(
+    store: Store, match: Match, clip: str, *, with_joints: bool = True
+) -> IdentityReplay:
     """Return the tracks of a clip with all corrections, including those no run contains yet.
 
     Raises:
@@ -45,9 +50,9 @@ def identities_now(store: Store, match: Match, clip: str) -> IdentityReplay:
     require_results([name] if name in results else [], f"clip {clip}", "tracks", match_id)
     stored = open_stored(store, store.run(match_id), name, "identities")
     moves = [edit for edit in said if isinstance(edit, TRACK_EDITS)]
-    later = edits_since(moves, stored.edits, f"clip {clip}", match_id)
+    edits_since(moves, stored.edits, f"clip {clip}", match_id)
     stated = _stated_names(store, match_id, clip)
-    return _replay(stored, said, moves[: len(moves) - len(later)], stated)
+    return _replay(stored, said, stated, with_joints=with_joints)
 
 
 def names_said(match: Match) -> str:
@@ -106,26 +111,40 @@ def _replay_names(run: Run, clip: str) -> tuple[dict[str, str], dict[int, str]]:
         return lost, {}
     moves = run.manifest(unit).recipe.sources.get("identities") or []
     assert isinstance(moves, list)
-    said: dict[str, IdentityEdit] = {}
-    for name, each in journal.corrections.items():
-        edit = each.edit
-        if not isinstance(edit, IDENTITY_EDITS) or edit.clip != clip:
-            continue
-        is_name = isinstance(edit, NamedTrack)
-        if name in journal.standing if is_name else edit.model_dump(mode="json") in moves:
-            said[name] = edit
+    said = _said_in(journal, clip, moves)
     stored = open_stored(run.store, run.record, unit, "identities")
-    moved = [edit for edit in said.values() if isinstance(edit, TRACK_EDITS)]
-    edits = list(said.values())
-    taken = moved if stored.edits else []
-    replay = _replay(stored, edits, taken, stated, with_joints=False)
+    replay = _replay(stored, [*said.values()], stated, with_joints=False)
     ids, names = replay.identities.person.tolist(), replay.identities.names
     lost |= {
         name: f"{edit.name!r} names no person: {why}. Name the person again, or withdraw the name"
         for (name, edit), why in zip(said.items(), replay.objections, strict=True)
         if isinstance(edit, NamedTrack) and edit.name and why and edit.name not in names.values()
     }
-    return lost | _lost_stated(clip, stated, ids, names), names
+    gone = _merged_away([*said.values()], replay.objections)
+    return lost | _lost_stated(clip, stated, {*ids} - gone, names), names
+
+
+def _said_in(journal: Journal, clip: str, moves: Sequence[JsonValue]) -> dict[str, IdentityEdit]:
+    """Return the names in force and the merges and splits of a result, in order, by correction.
+
+    Corrections can be equal: those of a result are the first in force, or the newest that fit if
+    some were withdrawn since.
+    """
+    own: dict[str, IdentityEdit] = {}
+    for name, each in journal.corrections.items():
+        if isinstance(each.edit, IDENTITY_EDITS) and each.edit.clip == clip:
+            own[name] = each.edit
+    as_json = {name: edit.model_dump(mode="json") for name, edit in own.items()}
+    names = {name for name, edit in own.items() if isinstance(edit, NamedTrack)}
+    taken = [name for name in journal.standing if name in own.keys() - names][: len(moves)]
+    if [as_json[name] for name in taken] != moves:
+        taken, left = [], [*moves]
+        for name in reversed(own):
+            if left and as_json[name] == left[-1]:
+                taken.append(name)
+                left.pop()
+    kept = {*taken, *(names & journal.standing.keys())}
+    return {name: edit for name, edit in own.items() if name in kept}
 
 
 def _stated_names(store: Store, match_id: str, clip: str) -> dict[int, str]:
@@ -141,7 +160,8 @@ def _lost_stated(
     """Return why names of match.yaml fit no person, by clip and person."""
     return {
         f"{clip}/{person}": f"{name!r} in match.yaml names no person: clip {clip} has no person "
-        f"{person}. Correct the clip's `people`"
+        f"{person} that no merge removed. Correct the clip's `people`, or name the person by a "
+        "correction"
         for person, name in stated.items()
         if person not in ids and name not in names.values()
     }
@@ -150,56 +170,62 @@ def _lost_stated(
 def _replay(
     stored: StoredResult,
     said: Sequence[IdentityEdit],
-    taken: Sequence[IdentityEdit],
     stated: Mapping[int, str],
     *,
     with_joints: bool = True,
 ) -> IdentityReplay:
-    """Replay corrections over a result that contains the merges and splits `taken` already.
+    """Replay corrections over a result, which can contain the first merges and splits already.
 
-    People whom no correction names, or leaves without a name, have the names `stated`. The
-    objections are in the order of `said`.
+    People whom no correction names, or leaves without a name, have the names `stated`, unless a
+    merge removed their id. The objections are in the order of `said`.
     """
     merged, others = dict[int, IdentityEdit](), dict[int, IdentityEdit]()
+    moves = (number for number, edit in enumerate(said) if isinstance(edit, TRACK_EDITS))
+    taken = dict(zip(moves, stored.result.attrs["objections"], strict=False))
     for number, edit in enumerate(said):
         if isinstance(edit, NamedTrack):
             person, seen = edit.person, edit.seen
-            for move in said[number + 1 :]:
-                if move in taken and isinstance(move, MergedTracks) and move.merged == person:
+            for move in (said[n] for n, why in taken.items() if n > number and why is None):
+                if isinstance(move, MergedTracks) and move.merged == person:
                     person = move.kept
-                elif move in taken and isinstance(move, SplitTrack) and move.person == person:
+                elif isinstance(move, SplitTrack) and move.person == person:
                     seen = None  # it can belong to the new person, and the name does not
             after = edit.model_copy(update={"person": person, "seen": seen})
             (others if person == edit.person else merged)[number] = after
-        elif edit not in taken:
+        elif number not in taken:
             others[number] = edit
     tracks = stored_identities(stored.result, with_joints=with_joints)
     order = merged | others  # a person's own name counts more
     replay = replay_identities(tracks, order.values())
-    found = dict(zip(order, replay.objections, strict=True))
-    gone = {move.merged: at for at, move in enumerate(said) if isinstance(move, MergedTracks)}
-    nameless = {
+    found = taken | dict(zip(order, replay.objections, strict=True))
+    objections = tuple(found.get(number) for number in range(len(said)))
+    nameless = _merged_away(said, objections) | {
         edit.person
         for number, edit in others.items()
         if isinstance(edit, NamedTrack) and edit.name is None and found[number] is None
-        if gone.get(edit.person, -1) < number  # later a split can give the id to another person
     }
     now = replay.identities
     left = {who: name for who, name in stated.items() if who in now.person and who not in nameless}
-    return IdentityReplay(
-        replace(now, names=left | now.names),
-        tuple(found.get(number) for number in range(len(said))),
-    )
+    return IdentityReplay(replace(now, names=left | now.names), objections)
 
 
-def require_fitting(store: Store, match: Match, edits: Sequence[Edit]) -> None:
-    """Refuse identity corrections that do not fit the current tracks.
+def _merged_away(said: Sequence[IdentityEdit], objections: Sequence[str | None]) -> set[int]:
+    """Return the ids that merges removed; later a split can give them to other people."""
+    edits = zip(said, objections, strict=True)
+    return {edit.merged for edit, why in edits if isinstance(edit, MergedTracks) and why is None}
+
+
+def require_fitting(store: Store, match: Match, edits: Sequence[Edit]) -> list[Edit]:
+    """Return edits, those of identities with sightings of their people in the current tracks.
+
+    So an edit does not apply to whom other tracks give the id.
 
     Raises:
         StaleEditError: another person changed the identities, or the edit never fitted.
     """
     found: dict[str, Identities] = {}
-    for edit in edits:
+    seen = list(edits)
+    for number, edit in enumerate(edits):
         if not isinstance(edit, IDENTITY_EDITS):
             continue
         if edit.clip not in found:
@@ -212,4 +238,17 @@ def require_fitting(store: Store, match: Match, edits: Sequence[Edit]) -> None:
                 clip=edit.clip,
                 kind=edit.kind,
             )
+        seen[number] = _add_sightings(found[edit.clip], edit)
         found[edit.clip] = replay_identities(found[edit.clip], [edit]).identities
+    return seen
+
+
+def _add_sightings(found: Identities, edit: IdentityEdit) -> IdentityEdit:
+    """Return an edit that applies to `found`, with sightings of its people where it has none."""
+    people = {"seen": "person", "kept_seen": "kept", "merged_seen": "merged"}
+    update = {
+        seen: find_sighting(found, getattr(edit, person))
+        for seen, person in people.items()
+        if hasattr(edit, person) and getattr(edit, seen) is None
+    }
+    return edit.model_copy(update=update)

@@ -321,6 +321,7 @@ class LocalRuns:
     _at_work: str | None = None
     _output: Path | None = None
     _process: subprocess.Popen[bytes] | None = None
+    _is_cancelled: bool = False
     _ended: dict[str, tuple[int, Path | str, datetime]] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
 
@@ -370,6 +371,7 @@ class LocalRuns:
             self._waiting = [each for each in self._waiting if each[0] != match_id]
             is_at_work = match_id == self._at_work and self._process is not None
             if is_at_work and self._process is not None:
+                self._is_cancelled = True
                 os.killpg(self._process.pid, signal.SIGINT)
                 # Some ignore it, as what is started in the background of a script.
                 later = Timer(PATIENCE_SECONDS, _terminate, [self._process])
@@ -412,5 +414,7 @@ class LocalRuns:
                 env=without_secrets(os.environ, keep=STORE_SECRETS),
             )
         with self._lock:
-            self._process = process
-        return process.wait(), said
+            self._process, self._is_cancelled = process, False
+        code = process.wait()
+        # Before the command handles it, the signal of `cancel` ends the process.
+        return 130 if code < 0 and self._is_cancelled else code, said

@@ -14,14 +14,14 @@ from data_contracts.records import Count, Name, Record
 from data_contracts.review import Correction, Edit
 from data_contracts.run import GatePolicy
 from flows.layers import merge_general
-from flows.review.corrections import keep_edits, objections_of, owner_of
+from flows.review.corrections import keep_edits, objections_now, owner_of
 from flows.review.descriptions import in_words, is_first_click
 from flows.review.verdicts import decide, still_waiting, withdraw
 from flows.run_record import latest_run
 from flows.running import RunRequest
 from flows.stage import Match
 from flows.web.app_context import PageContext, Person
-from worldpose.store.store import Run, Store
+from worldpose.store.store import Store
 
 SESSION_GAP: Final = timedelta(minutes=30)
 """A longer pause of a person begins a new session."""
@@ -109,8 +109,7 @@ class Group:
 
 def group_corrections(store: Store, match: Match) -> list[Group]:
     """Return all corrections in force in groups, the latest group first."""
-    latest = latest_run(store, match.match_id)
-    objections = {} if latest is None else objections_of(Run(store, latest))
+    objections = objections_now(store, match, latest_run(store, match.match_id))
     objections |= {each.id: why for each, why in match.stale}
     groups: list[Group] = []
     open_groups: dict[tuple[str, str, bool], Group] = {}

@@ -170,7 +170,10 @@ def _interpolate(
         detection = known.get(frame, -1)
         if detection < 0 or frame in hidden:
             continue
-        place = detections_now(store, match, camera, frame).keypoints[0, detection, joint]
+        there = detections_now(store, match, camera, frame)
+        if np.isnan(there.score[0, detection]):  # a correction deleted it
+            continue
+        place = there.keypoints[0, detection, joint]
         was = (float(place[0]), float(place[1])) if np.isfinite(place).all() else None
         share = (frame - last.frame) / (given.frame - last.frame)
         x, y = (1.0 - share) * np.asarray(last.xy) + share * np.asarray(now)

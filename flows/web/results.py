@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import shutil
-from collections.abc import Callable
-from dataclasses import asdict
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Lock
@@ -30,7 +30,7 @@ from flows.results.best_results import (
     open_results,
     tracked_people,
 )
-from flows.results.comparison import SubjectChange, compare_runs
+from flows.results.comparison import SubjectChange, compare_runs, paired_people
 from flows.results.export import export, forms_without_people
 from flows.results.outputs import OWNERS
 from flows.results.run_cameras import broadcast_views
@@ -277,6 +277,27 @@ def describe_changes(changes: list[SubjectChange]) -> list[dict[str, Any]]:
     return [asdict(each) for each in changes if each.mark != "unchanged"]
 
 
+def _name_as_after(
+    changes: list[SubjectChange], paired: Mapping[tuple[str, str], str], before: str
+) -> list[SubjectChange]:
+    """Name players by their ids in the second run, which the metrics and names of a page have."""
+    names = {
+        f"{clip}: {other}".replace("person", "person "): f"{clip}: person {person[6:]}"
+        for (clip, person), other in paired.items()
+    }
+    return [
+        replace(
+            each,
+            name=f"{each.name} of run {before}"
+            if each.mark == "only in A"
+            else names.get(each.name, each.name),
+        )
+        if each.kind == "player"
+        else each
+        for each in changes
+    ]
+
+
 def _describe_metrics(context: PageContext, match: Match, run: Run) -> dict[str, Any]:
     """Return the metrics of a run, and their changes since the run before it."""
     record, parent = run.record, run.record.parent
@@ -284,7 +305,11 @@ def _describe_metrics(context: PageContext, match: Match, run: Run) -> dict[str,
     if parent is not None:
         try:
             before = context.store.run(match.match_id, parent)
-            changes = compare_runs(context.store, before, record)
+            changes = _name_as_after(
+                compare_runs(context.store, before, record),
+                paired_people(context.store, before, record),
+                parent,
+            )
         except WorldposeError as error:  # its results may be garbage collected
             problem = f"Run {parent} cannot be compared: {describe_error(error)}"
     return {

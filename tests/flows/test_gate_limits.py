@@ -2,11 +2,13 @@
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
-from run_records import match_spec
+from run_records import AT, match_spec, review_request
 
-from flows.gates import GATES
+from data_contracts.review import ReviewDecision
+from flows.gates import GATES, Gatekeeper
 from flows.method import METHOD
 from flows.review.advice import click_advice, clock_advice
 from flows.review.metric_words import UNITS, all_reasons, in_short, metric_words, reason_words
@@ -83,6 +85,38 @@ def test_auto_objects_to_figures_beyond_their_limits(gate, figures, objected):
     lines = gate.objections(figures).values()
     assert len(lines) == len(objected)
     assert all(line.startswith(start) for line, start in zip(lines, objected, strict=True))
+
+
+HEALTHY = {"standard_deviation_m": 0.01, "filled_share": 0.0, "joints": 9.0}
+
+
+def unhealthy(**cameras):
+    parts = {f"unhealthy_share.{name}": share for name, share in cameras.items()}
+    return HEALTHY | {"unhealthy_share": max(cameras.values())} | parts
+
+
+@pytest.mark.parametrize(
+    ("now", "is_known"),
+    [
+        (unhealthy(a=0.3, b=0.0), True),
+        (unhealthy(a=0.29, b=0.05), True),  # a camera within the limit is no question
+        (unhealthy(a=0.0, b=0.29), False),
+        (unhealthy(a=0.3, b=0.06), False),
+        (unhealthy(a=0.3, c=0.1), False),
+        (HEALTHY | {"unhealthy_share": 0.3}, True),
+        ({**unhealthy(a=0.3), "filled_share": 0.9}, False),
+    ],
+)
+def test_an_approval_covers_the_cameras_that_were_approved(now, is_known):
+    unit = "triangulation/clip"
+    gate, keys = GATES["triangulation"], {unit: "0" * 32}
+    asked = review_request("q", keys=keys, figures=unhealthy(a=0.3, b=0.0))
+    given = {"match_id": "m", "request": "q", "verdict": "approve", "who": "Ada"}
+    journal = SimpleNamespace(questions=(asked, ReviewDecision(**given, decided_at=AT)))
+    keeper = Gatekeeper(None, SimpleNamespace(journal=journal), "auto")
+    manifest = SimpleNamespace(figures=now, left_out={})
+    assert gate.objections(now)
+    assert keeper._is_known(gate, unit, manifest) is is_known
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from page_client import MATCH
 
 from data_contracts.match import PlayerSpec
 from data_contracts.review import (
+    AddedDetection,
     Correction,
     DeletedDetection,
     MergedTracks,
@@ -19,7 +20,8 @@ from data_contracts.review import (
 )
 from flows.registering import open_match
 from flows.results.best_results import clip_positions
-from flows.review.corrections import keep_edits, objections_of
+from flows.review.corrections import keep_edits, objections_now, objections_of
+from flows.review.detections import detections_now
 from flows.review.edit_conflicts import StaleEditError
 from flows.review.identities import identities_now, lost_names, names_of
 from flows.review.verdicts import correct, origins_of, withdraw
@@ -204,9 +206,30 @@ def test_names_of_the_match_folder_are_of_the_people_after_merges_and_in_no_othe
     compute(store, unit)
     results = {**record.results, "tracking/clip": unit.key}
     run = Run(store, record.model_copy(update={"results": results}))
-    assert names_now() == {one: "Bob", other: "bea", new: "dora"}
+    assert names_now() == {one: "Bob", other: "bea"}  # a merge removed Dora's id
     assert names_of(run, "clip") == {one: "Bob"}
     assert "this run has other tracks" in lost_names(run)["clip"]
+
+
+def test_a_correction_that_the_withdrawal_of_another_ends_is_told_before_the_next_run(store):
+    def objections():
+        return objections_now(store, open_match(store, TINY), latest_run(store, TINY))
+
+    found = identities_now(store, open_match(store, TINY), "clip").identities
+    new, (first, *_, last) = int(found.person.max()) + 1, found.frame.tolist()
+    middle = (first + last) // 2
+    say(store, a=SplitTrack(clip="clip", person=0, first_frame_of_new=middle))
+    say(store, b=SplitTrack(clip="clip", person=new, first_frame_of_new=middle + 5))
+    free = detections_now(store, open_match(store, TINY), "cam01", first).score.shape[1]
+    at = {"camera": "cam01", "frame": first, "detection": free}
+    say(store, c=AddedDetection(**at, box=(1.0, 2.0, 30.0, 40.0)))
+    say(store, d=DeletedDetection(**at), e=DeletedDetection(**at | {"detection": 0}))
+    assert objections() == {}
+    withdraw(store, open_match(store, TINY), ["a", "c"], who="Ada", why="")
+    assert objections() == {
+        "b": f"clip clip has no person {new}",
+        "d": f"there is no detection {free} of cam01 in frame {first}",
+    }
 
 
 def test_every_door_refuses_what_does_not_fit_the_results(store):
@@ -224,7 +247,7 @@ def test_every_door_refuses_what_does_not_fit_the_results(store):
     assert read_journal(store, TINY).entries == ()
 
 
-def test_what_a_run_refused_is_told_so_and_what_no_run_has_yet(store):
+def test_what_a_run_refused_is_told_so_and_what_no_run_has_yet(store, tmp_path):
     edits = {
         "out": DeletedDetection(camera="cam01", frame=5, detection=77),
         "one": MergedTracks(clip="clip", kept=0, merged=88),
@@ -245,7 +268,13 @@ def test_what_a_run_refused_is_told_so_and_what_no_run_has_yet(store):
 
     match, until = open_match(store, TINY), selected_stages(None, "tracking")
     record = RunLog.begin(store, match, until, {}).run_stages(compute_units)
+    told = objections_of(Run(store, record))
+    # As after a garbage collection.
+    plain = ResultId(TINY, "ingest", "cam01", store.run(TINY, "0001").results["ingest/cam01"])
+    (store.blobs.root / plain.path).rename(tmp_path / "plain")
     found = objections_of(Run(store, record))
+    (tmp_path / "plain").rename(store.blobs.root / plain.path)
+    assert found == told
     assert "there is no detection 77" in found["out"] and "no person 88" in found["one"]
     assert not {"corrected"} & {*origins_of(store, open_match(store, TINY), record).values()}
     deleted = DeletedDetection(camera="cam01", frame=5, detection=0)

@@ -83,6 +83,14 @@ def test_a_run_is_cancelled(ada, monkeypatch):
     while (ada.get(MATCH).json()["at_work"] or {}).get("state") == "running":
         assert time.monotonic() - begun < 40
         time.sleep(0.2)
+    assert ada.get(MATCH).json()["at_work"]["code"] == 130  # as the command itself ends
+    killed = [sys.executable, "-c", "import os; os.kill(os.getpid(), 2)"]
+    monkeypatch.setattr(app_context, "_COMMAND", killed)
+    ada.post(f"{MATCH}/runs", json={}).raise_for_status()
+    while ada.get(MATCH).json()["at_work"]["state"] == "running":
+        assert time.monotonic() - begun < 80
+        time.sleep(0.2)
+    assert ada.get(MATCH).json()["at_work"]["code"] == -2  # by nobody here
 
 
 def test_a_run_that_cannot_start_has_its_reason_and_delays_no_other(store, monkeypatch):
@@ -118,8 +126,8 @@ def test_a_keypoint_is_filled_in_between_two_corrections(ada, project_copy):
     store = Store.open(str(project_copy))
     match = open_match(store, TINY)
     found = identities_now(store, match, "clip").identities
-    row, k = 5, int((found.detection_index[5:10] >= 0).all(axis=0).sum(axis=0).argmax())
-    c = int(np.flatnonzero((found.detection_index[row : row + 5, :, k] >= 0).all(axis=0))[0])
+    row, k = 5, int((found.detection_index[5:11] >= 0).all(axis=0).sum(axis=0).argmax())
+    c = int(np.flatnonzero((found.detection_index[row : row + 6, :, k] >= 0).all(axis=0))[0])
     camera, path = found.cameras[c], f"{MATCH}/detections/{found.cameras[c]}/interpolation"
 
     def place(offset):
@@ -127,24 +135,28 @@ def test_a_keypoint_is_filled_in_between_two_corrections(ada, project_copy):
         seen = detections_now(store, open_match(store, TINY), camera, frame)
         return {"frame": frame, "detection": int(detection)}, seen.keypoints[0, detection]
 
-    joint = int(np.isfinite(np.stack([place(n)[1] for n in range(5)])).all(axis=(0, 2)).argmax())
-    assert ada.post(path, json={**place(4)[0], "joint": COCO17[joint]}).status_code == 422
+    joint = int(np.isfinite(np.stack([place(n)[1] for n in range(6)])).all(axis=(0, 2)).argmax())
+    assert ada.post(path, json={**place(5)[0], "joint": COCO17[joint]}).status_code == 422
     for odd in ({"joint": "zz"}, {"joint": COCO17[joint], "detection": 5000}):
-        assert ada.post(path, json={**place(4)[0], **odd}).status_code == 422
-    unknown = {"kind": "moved_keypoint", "camera": camera, **place(4)[0], "joint": "zz", "xy": None}
+        assert ada.post(path, json={**place(5)[0], **odd}).status_code == 422
+    unknown = {"kind": "moved_keypoint", "camera": camera, **place(5)[0], "joint": "zz", "xy": None}
     edits = {"edits": [{"id": "moved_keypoint.zz", "edit": unknown}]}
     assert ada.post(f"{MATCH}/corrections", json=edits).status_code == 409
     for number, (offset, xy) in enumerate(
         # The last correction of a frame counts.
-        ((0, (700.0, 20.0)), (0, (100.0, 200.0)), (3, None), (4, (140.0, 208.0)))
+        ((0, (700.0, 20.0)), (0, (100.0, 200.0)), (3, None), (5, (150.0, 210.0)))
     ):
         at, was = place(offset)
         edit = {"kind": "moved_keypoint", "camera": camera, **at, "joint": COCO17[joint], "xy": xy}
         edit["was"] = [float(value) for value in was[joint]]
         edits = {"edits": [{"id": f"moved_keypoint.{number}", "edit": edit}]}
         ada.post(f"{MATCH}/corrections", json=edits).raise_for_status()
-    kept = ada.post(path, json={**place(4)[0], "joint": COCO17[joint]}).json()["kept"]
+    gone = {"kind": "deleted_detection", "camera": camera, **place(4)[0]}
+    edits = {"edits": [{"id": "deleted_detection.4", "edit": gone}]}
+    ada.post(f"{MATCH}/corrections", json=edits).raise_for_status()
+    kept = ada.post(path, json={**place(5)[0], "joint": COCO17[joint]}).json()["kept"]
     assert len(kept) == 2
-    filled = [place(n)[1][joint].tolist() for n in (0, 1, 2, 4)]
-    assert filled == [[100, 200], [110, 202], [120, 204], [140, 208]]
+    filled = [place(n)[1][joint].tolist() for n in (0, 1, 2, 5)]
+    assert filled == [[100, 200], [110, 202], [120, 204], [150, 210]]
     assert np.isnan(place(3)[1][joint]).all()  # it was said to be invisible there
+    assert np.isnan(place(4)[1]).all()

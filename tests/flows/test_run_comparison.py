@@ -13,8 +13,9 @@ from data_contracts.match import Registration, SourceFile
 from data_contracts.review import DeletedDetection, MovedPoint
 from flows.cli.app import app
 from flows.results import comparison
-from flows.results.comparison import BodiesOfBoth, compare_runs, pair_people
+from flows.results.comparison import BodiesOfBoth, SubjectChange, compare_runs, pair_people
 from flows.review.verdicts import unit_origins
+from flows.web.results import _name_as_after
 from worldpose.errors import InputError
 from worldpose.geometry.rigid import Rigid
 from worldpose.store.store import Store
@@ -223,3 +224,18 @@ def test_a_folders_digest_is_of_the_names_and_contents_below_it():
         assert other.digest_of("videos/cam00") != first.digest_of("videos/cam00")
     moved = files(videos_cam01_1="1", videos_cam01_2="2")
     assert moved.digest_of("videos/cam01") == first.digest_of("videos/cam00")
+
+
+def test_the_page_of_a_run_names_its_people_by_the_ids_of_that_run():
+    paired = {("c", "person3"): "person5", ("c", "person5"): "person5 of B"}
+    rows = [
+        ("c: person 5", "worse"),
+        ("c: person 5 of B", "only in B"),
+        ("c: person 3", "only in A"),
+    ]
+    changes = [SubjectChange("player", name, mark, ()) for name, mark in rows]
+    changes += [SubjectChange("player", "c: person 1", "better", ())]
+    changes += [SubjectChange("camera", "c: person 3", "only in A", ())]
+    named = [each.name for each in _name_as_after(changes, paired, "0002")]
+    people = ["c: person 3", "c: person 5", "c: person 3 of run 0002", "c: person 1"]
+    assert named == [*people, "c: person 3"]

@@ -42,7 +42,7 @@ def replay_detections(found: KeypointDetections, edits: Iterable[DetectionEdit])
 
     An edit applies only if the current value equals its `was`. Corrected keypoints and added people
     have confidence 1; other keypoints, and the indices of detections, stay. If an added person
-    exceeds the number of detections, every frame gets one more. `found` is not modified.
+    exceeds the number of detections, every frame gets more. `found` is not modified.
     """
     changed = found.with_arrays(
         {name: array.copy() for name, array in found.arrays().items()}, found.frame
@@ -80,7 +80,7 @@ def find_objection(found: KeypointDetections, edit: DetectionEdit) -> str | None
     places = found.score.shape[1]
     is_there = 0 <= edit.detection < places and not np.isnan(found.score[row, edit.detection])
     if isinstance(edit, AddedDetection):
-        if edit.detection > places:
+        if edit.detection > places + 99:  # places of people whose corrections were withdrawn stay
             return f"{place} would leave places free before it: {places} is the next"
         return f"there is a {place} already" if is_there else None
     if not is_there:
@@ -104,10 +104,11 @@ def find_objection(found: KeypointDetections, edit: DetectionEdit) -> str | None
 
 def _with_place(found: KeypointDetections, detection: int) -> KeypointDetections:
     """Return observations with room for a detection index; new entries are NaN."""
-    if detection < found.score.shape[1]:
-        return found
+    more = max(0, detection + 1 - found.score.shape[1])
     widened = {
-        name: np.pad(array, [(0, 0), (0, 1)] + [(0, 0)] * (array.ndim - 2), constant_values=np.nan)
+        name: np.pad(
+            array, [(0, 0), (0, more)] + [(0, 0)] * (array.ndim - 2), constant_values=np.nan
+        )
         for name, array in found.arrays().items()
     }
     return found.with_arrays(widened, found.frame)
@@ -199,9 +200,9 @@ def find_changes(
 
 
 def _exported_name(given: str, known: dict[str, AnnotatedImage]) -> str | None:
-    """Return the exported image's name for an annotator's name."""
-    name = PurePosixPath(given.replace("\\", "/")).name
-    return next((each for each in known if name == each or name.endswith(f"-{each}")), None)
+    """Return the exported image's name for an annotator's name; a camera's id can have a `-`."""
+    name = "-" + PurePosixPath(given.replace("\\", "/")).name
+    return max((each for each in known if name.endswith(f"-{each}")), key=len, default=None)
 
 
 def _list_moved(at: dict[str, object], before: Floats, now: Floats) -> list[MovedKeypoint]:

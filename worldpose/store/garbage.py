@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from itertools import islice
 
 from data_contracts.run import Reservation, RunRecord
 from worldpose.errors import CorruptionError, InputError, StoreError
@@ -62,7 +61,7 @@ def plan_gc(
     Args:
         store: the project.
         keep_last: keep only this many of each match's newest run records, and the newest complete
-            one; None keeps all.
+            one with results of each stage; None keeps all.
         forget: runs to drop, as `match/0003`; an unfinished one counts as dead, and a pinned one
             must be unpinned first.
         older_than: the age below which results and leftovers are kept.
@@ -190,17 +189,25 @@ def _select_runs(
     wanted = [run_id for run_id in finished if f"{match_id}/{run_id}" not in forget]
     chosen = {*pinned, *wanted}
     if keep_last is not None:
-        complete = (it for it in reversed(wanted) if _is_complete(store, match_id, it))
-        chosen = {*pinned, *({*wanted} & {*finished[-keep_last:]}), *islice(complete, 1)}
+        last = {*finished[-keep_last:], *_find_last_of_stages(store, match_id, wanted)}
+        chosen = {*pinned, *({*wanted} & last)}
     kept = [run_id for run_id in finished if run_id in chosen]
     return [run_id for run_id in finished if run_id not in kept], kept
 
 
-def _is_complete(store: Store, match_id: str, run_id: str) -> bool:
-    try:
-        return store.run(match_id, run_id).state == "complete"
-    except (CorruptionError, InputError):  # if it is kept, its match is skipped
-        return False
+def _find_last_of_stages(store: Store, match_id: str, run_ids: Sequence[str]) -> Iterator[str]:
+    """Yield the newest complete runs with results of each stage; partial ones for other stages."""
+    had: set[str] = set()
+    for state in ("complete", "partial"):
+        for run_id in reversed(run_ids):
+            try:
+                record = store.run(match_id, run_id)
+            except (CorruptionError, InputError):  # if it is kept, its match is skipped
+                continue
+            stages = {name.partition("/")[0] for name in record.results}
+            if record.state == state and stages - had:
+                had |= stages
+                yield run_id
 
 
 def _reservations(

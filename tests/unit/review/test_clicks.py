@@ -232,6 +232,17 @@ def test_what_only_was_rounded_is_no_change(name):
     assert find_changes(BEFORE, [], "file").edits == ()  # a picture that did not come back
 
 
+@pytest.mark.parametrize("prefix", ["", "pictures/", "f00-"])
+def test_a_picture_is_of_the_camera_whose_whole_name_it_has(prefix):
+    names = [image_name(camera, 120) for camera in ("1", "north-1", "west")]
+    before = [picture(person(0), name=name) for name in names]
+    for camera, name in zip(("1", "north-1", "west"), names, strict=True):
+        (edit,) = find_changes(before, [picture(name=prefix + name)], "file").edits
+        assert edit.camera == camera
+    back = [picture(person(0), name=prefix + name) for name in reversed(names)]
+    assert find_changes(before, back, "file").edits == ()
+
+
 def test_moved_hidden_found_added_and_deleted_are_told_apart():
     changed = person(7)
     changed.keypoints[0] = (5.0, 6.0)
@@ -342,7 +353,7 @@ def test_a_keypoint_put_elsewhere_is_certain():
         (deleted(frame=FIRST + 1, detection=1), "no detection 1"),
         (deleted(was=(1.0, 1.0, 1.0, 2.0)), "was [1.0, 1.0, 1.0, 2.0] when it was deleted"),
         (added_person(0), "there is a detection 0"),
-        (added_person(3), "2 is the next"),
+        (added_person(102), "2 is the next"),
     ],
 )
 def test_what_does_not_fit_what_was_seen_says_why_and_changes_nothing(edit, reason):
@@ -361,3 +372,15 @@ def test_an_added_person_takes_a_free_place_and_is_certain():
     after = replay_detections(observations(), [added_person(1)]).observations
     assert (after.score[1, 1], after.confidence[1, 1, 0]) == (1.0, 1.0)
     assert after.boxes[1, 1].tolist() == [1.0, 2.0, 5.0, 9.0]
+
+
+def test_an_added_person_stays_when_one_that_was_added_before_is_withdrawn():
+    first, second = added_person(2), added_person(3, nose=(7.0, 8.0))
+    moved = keypoint((1.0, 1.0), was=(7.0, 8.0), frame=FIRST + 1, detection=3)
+    both = replay_detections(observations(), [first, second, moved])
+    one = replay_detections(observations(), [second, moved])
+    assert (both.objections, one.objections) == ((None,) * 3, (None,) * 2)
+    for each in (both, one):
+        assert each.observations.keypoints[1, 3, 0].tolist() == [1.0, 1.0]
+    assert np.isnan(one.observations.score[:, 2]).all()
+    assert np.isfinite(both.observations.score[1, 2])

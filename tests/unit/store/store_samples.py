@@ -95,7 +95,8 @@ def sample_work(store, recipe=None, run_id="0001"):
 
 def publish(store, recipe=None, seed=0, run_id="0001"):
     with store.publish(sample_work(store, recipe, run_id)) as writer:
-        writer.write(LAYOUT, sample_arrays(seed), sample_coordinates(), ATTRIBUTES)
+        layout = LAYOUT.model_copy(update={"stage": (recipe or sample_recipe()).stage})
+        writer.write(layout, sample_arrays(seed), sample_coordinates(), ATTRIBUTES)
         writer.figures["mean_views"] = 2.5
     return writer
 

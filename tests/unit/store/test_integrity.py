@@ -278,6 +278,19 @@ def test_the_newest_complete_run_outlasts_newer_ones_that_failed(two_runs):
     assert plan.garbage[0].path == "runs/final/0002.json"
 
 
+@pytest.mark.parametrize("state", ["complete", "partial"])
+def test_the_newest_run_with_bodies_outlasts_newer_parts_of_the_method(two_runs, state):
+    tracked, fitted = sample_recipe("third"), sample_recipe(stage="body_fitting")
+    whole = two_runs.reserve_run("final")
+    publish(two_runs, fitted, run_id=whole)
+    two_runs.finish_run(sample_record(whole, sample_recipe("first"), fitted, state=state))
+    parts = [run_once(two_runs, tracked) for _ in range(2)]
+    collect(two_runs, plan_gc(two_runs, keep_last=1, older_than=PLAN_NOW))
+    assert two_runs.runs("final") == (whole, parts[-1])
+    assert two_runs.has(*place(sample_recipe("first")))
+    assert not two_runs.has(*place(sample_recipe("second")))
+
+
 @pytest.mark.parametrize("number", ["0002", "0004"])
 @pytest.mark.parametrize("is_damaged", [True, False])
 def test_an_unreadable_record_is_not_complete_and_does_not_end_the_planning(

@@ -1,0 +1,125 @@
+"""Corrections of identities over stored tracks, with and without those before the corrections."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import xarray as xr
+from run_records import correction
+
+from data_contracts.review import MergedTracks, MovedPoint, NamedTrack, SplitTrack
+from flows.review import identities
+from flows.review.edit_conflicts import StoredResult
+from worldpose.review.identities import IdentityReplay, replay_identities, stored_identities
+from worldpose.review.journal import Journal
+
+FRAMES = 12
+
+
+def tracks(*edits):
+    """Tracks of three people whom two cameras see all the time, as a run stores them."""
+    index = np.broadcast_to(np.arange(3, dtype=np.int16), (FRAMES, 2, 3))
+    result = xr.Dataset(
+        {"detection_index": (("frame", "camera", "person"), index)},
+        {"frame": np.arange(FRAMES), "camera": ["a", "b"], "person": np.arange(3, dtype=np.int32)},
+        {"joins": [], "changes": [], "objections": []},
+    )
+    replay = replay_identities(stored_identities(result, with_joints=False), edits)
+    found = replay.identities
+    return xr.Dataset(
+        {"detection_index": (("frame", "camera", "person"), found.detection_index)},
+        {"frame": found.frame, "camera": [*found.cameras], "person": found.person},
+        result.attrs | {"objections": [*replay.objections]},
+    )
+
+
+def merge(kept, merged):
+    return MergedTracks(clip="clip", kept=kept, merged=merged)
+
+
+def split(person, frame):
+    return SplitTrack(clip="clip", person=person, first_frame_of_new=frame)
+
+
+def named(person, name):
+    return NamedTrack(clip="clip", person=person, name=name)
+
+
+def replay(said, taken=0, stated=None):
+    """Replay corrections over the tracks with the first of the merges and splits."""
+    moves = [edit for edit in said if not isinstance(edit, NamedTrack)][:taken]
+    stored = StoredResult(
+        tracks(*moves), "0" * 32, [each.model_dump(mode="json") for each in moves]
+    )
+    return identities._replay(stored, said, stated or {}, with_joints=False)
+
+
+@pytest.mark.parametrize("taken", range(5))
+def test_an_edit_made_twice_is_replayed_twice_whatever_the_tracks_contain(taken):
+    said = [split(0, 6), named(3, "Bo"), merge(0, 3), split(0, 6), merge(2, 9), named(3, "Al")]
+    whole = replay(said).identities
+    found = replay(said, taken)
+    assert found.identities.person.tolist() == [0, 1, 2, 3]
+    assert np.array_equal(found.identities.detection_index, whole.detection_index)
+    assert found.identities.names == whole.names == {0: "Bo", 3: "Al"}
+    assert [bool(why) for why in found.objections] == [False, False, False, False, True, False]
+
+
+@pytest.mark.parametrize("taken", range(5))
+def test_a_name_of_the_match_folder_is_not_that_of_who_gets_the_id_later(taken):
+    stated = {1: "bea", 2: "cleo", 3: "dora"}
+    said = [split(2, 6), merge(2, 3), merge(1, 9), split(1, 6)]
+    after = replay(said, taken, stated)
+    found, gone = after.identities, identities._merged_away(said, after.objections)
+    assert (found.person.tolist(), found.names) == ([0, 1, 2, 3], {1: "bea", 2: "cleo"})
+    (why,) = identities._lost_stated("clip", stated, {0, 1, 2, 3} - gone, found.names).values()
+    assert "'dora' in match.yaml names no person: clip clip has no person 3 that no merge" in why
+    # A split alone, and merges that do not apply, take no name away.
+    refused = [split(1, 6), merge(0, 2), merge(9, 3)]
+    assert replay(refused, min(taken, 3), stated).identities.names == stated
+
+
+@pytest.mark.parametrize("edit", [merge(0, 3), split(2, 6), named(2, "x")])
+def test_an_edit_is_kept_with_sightings_and_applies_to_no_other_person_of_the_id(edit, monkeypatch):
+    found = replay([split(0, 6)]).identities
+    monkeypatch.setattr(identities, "identities_now", lambda *_: IdentityReplay(found, ()))
+    click = MovedPoint(camera="a", marking="corner", xy=None)
+    full, kept_click = identities.require_fitting(None, None, [edit, click])
+    assert (edit != full, kept_click) == (True, click)
+    assert replay_identities(found, [full]).objections == (None,)
+    other = replace(
+        found, detection_index=np.where(found.detection_index < 0, -1, found.detection_index + 5)
+    )
+    assert replay_identities(other, [edit]).objections == (None,)
+    (why,) = replay_identities(other, [full]).objections
+    assert "is not the person that was seen" in why
+
+
+def journal(said, withdrawn=()):
+    """A journal of corrections by id, some of which were withdrawn."""
+    made = {name: correction(edit, name) for name, edit in said.items()}
+    standing = {name: each for name, each in made.items() if name not in withdrawn}
+    return Journal("m", corrections=made, standing=standing)
+
+
+SPLITS = {"a": split(0, 6), "b": split(1, 6), "c": split(0, 6), "n": named(4, "Al")}
+ANEW = {"a": split(0, 6), "n": named(3, "Al"), "b": merge(0, 3), "c": split(0, 6)}
+
+
+@pytest.mark.parametrize(
+    ("said", "withdrawn", "taken", "used"),
+    [
+        (SPLITS, "a", "bc", "bcn"),
+        (SPLITS, "", "ab", "abn"),  # a run before the last split
+        (SPLITS, "ac", "bc", "bcn"),  # an older run
+        (SPLITS, "an", "bc", "bc"),
+        (ANEW, "", "a", "an"),  # in force: the split before the name, and not the later one
+        (ANEW, "", "abc", "anbc"),
+        (ANEW, "b", "abc", "anbc"),
+    ],
+)
+def test_of_equal_corrections_a_result_has_each_once(said, withdrawn, taken, used):
+    moves = [said[name].model_dump(mode="json") for name in taken]
+    found = identities._said_in(journal(said, withdrawn), "clip", moves)
+    assert [*found] == [*used]
+    assert identities._said_in(journal(said, withdrawn), "other", []) == {}
