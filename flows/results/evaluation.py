@@ -13,7 +13,7 @@ from flows.registering import find_match
 from flows.results.best_results import clips_of, describe_age, joint_tracks, open_results
 from flows.results.run_cameras import broadcast_cameras, static_cameras
 from worldpose.dataset.benchmark import require_one_rate
-from worldpose.dataset.manifest import clip_frame_rate, read_frame_rates
+from worldpose.dataset.manifest import stated_rate
 from worldpose.errors import InputError, UsageError
 from worldpose.evaluation.cameras import CameraScore, evaluate_cameras
 from worldpose.evaluation.marker_reference import (
@@ -30,7 +30,7 @@ from worldpose.evaluation.position_reference import align_positions
 from worldpose.formats.joints_file import JointTracks, read_joints
 from worldpose.formats.release_cameras import read_camera
 from worldpose.geometry.cameras import Camera
-from worldpose.ingest.match_folder import MatchFolder, read_spec
+from worldpose.ingest.match_folder import MatchFolder, spec_around
 from worldpose.ingest.pitch_file import read_pitch
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.runs import LATEST
@@ -201,15 +201,12 @@ def reference_side(name: str) -> Side:
         InputError: there is no such file, or it has the wrong format.
     """
     path = Path(name)
-    above = [folder for folder in path.resolve().parents[:2] if (folder / "match.yaml").is_file()]
     match = None
-    if above:  # without its videos, which may be gone
-        spec = read_spec(above[0])
-        match = MatchFolder(above[0], spec, {}, {}, read_pitch(above[0], spec), {}, {}, {}, {})
+    if around := spec_around(path):  # without its videos, which may be gone
+        match = MatchFolder(*around, {}, {}, read_pitch(*around), {}, {}, {}, {})
     folder = path if path.is_dir() else path.parent
     clip = path.name.removesuffix(".npz").removesuffix(".joints")
-    rate = clip_frame_rate(read_frame_rates(folder), clip)
-    rate = match.spec.fps if rate is None and match is not None else rate
+    rate = stated_rate(folder, clip)
     files = sorted((path / "cameras").glob("*.npz"))
     if path.is_dir() and files:
         joints = read_joints(path / "joints.npz") if (path / "joints.npz").is_file() else None

@@ -17,7 +17,7 @@ from worldpose.body.model import BodyModel
 from worldpose.dataset.check import check_clip
 from worldpose.dataset.contents import SUBMISSIONS, ShippedClip, camera_files, list_clips, read_clip
 from worldpose.dataset.faults import LIMITS, camera_faults
-from worldpose.dataset.manifest import FRAME_RATES, clip_frame_rate, read_frame_rates
+from worldpose.dataset.manifest import FRAME_RATES, stated_rate
 from worldpose.errors import InputError
 from worldpose.evaluation import matching, metrics
 from worldpose.formats.archives import ARRAY_BYTES, read_npz, wrong
@@ -124,14 +124,14 @@ def score_folders(
     for clip, part in parts_of_clips(reference).items():
         truth = _read_people(part, clip, body, match_in)
         true, camera = truth.tracks.joints, _true_camera(truth)
-        stated = clip_frame_rate(read_frame_rates(part), clip)
+        stated = stated_rate(part, clip)
         shown = {}
         for name, folder in predictions.items():
             if clip not in parts[name]:
                 todo = "Write its poses, with NaN where the method found no person."
                 found = ", ".join(parts[name])
                 raise wrong(f"{folder}: clip {clip}", f"poses/{clip}.npz or joints", found, todo)
-            own = clip_frame_rate(read_frame_rates(parts[name][clip]), clip)
+            own = stated_rate(parts[name][clip], clip)
             require_one_rate({f"{part}": stated, f"{parts[name][clip]}": own})
             mine = _read_people(parts[name][clip], clip, body, match_in, truth)
             boxes = None if camera is None else _boxes(mine, truth, camera)
