@@ -25,7 +25,7 @@ from worldpose.evaluation.marker_reference import (
     read_marker_map,
     read_markers,
 )
-from worldpose.evaluation.metrics import PersonScore, evaluate_joints
+from worldpose.evaluation.metrics import PersonScore, count_views, evaluate_joints
 from worldpose.evaluation.position_reference import align_positions
 from worldpose.formats.joints_file import JointTracks, read_joints
 from worldpose.formats.release_cameras import read_camera
@@ -124,9 +124,8 @@ def score(
         mine, tracks, notes = align_positions(Path(reference), estimate.joints, first, known)
         estimate, truth = replace(estimate, joints=mine), Side(tracks, {})
     spec = None if match is None else match.spec
-    is_broadcast = estimate.match is not None and not estimate.match.spec.static_cameras
-    if is_broadcast and truth.joints is not None:  # `views` counts static cameras
-        truth = replace(truth, joints=replace(truth.joints, views=None))
+    if estimate.match is not None and truth.joints is not None:
+        truth = replace(truth, joints=count_views(truth.joints, estimate.match.spec))
     true_cameras = cameras_of(reference, truth, spec)
     if match_in is not None and match_in not in true_cameras:
         raise UsageError(
@@ -209,10 +208,13 @@ def reference_side(name: str) -> Side:
     rate = stated_rate(folder, clip)
     files = sorted((path / "cameras").glob("*.npz"))
     if path.is_dir() and files:
-        joints = read_joints(path / "joints.npz") if (path / "joints.npz").is_file() else None
+        joints = load_reference(name) if (path / "joints.npz").is_file() else None
         cameras = {file.stem: read_camera(file) for file in files}
-        return Side(joints, cameras, match, fps=rate)
-    return Side(load_reference(name), {}, match, fps=rate)
+    else:
+        joints, cameras = load_reference(name), {}
+    if joints is not None and around:
+        joints = count_views(joints, around[1])
+    return Side(joints, cameras, match, fps=rate)
 
 
 def is_of_files(name: str) -> bool:

@@ -25,6 +25,7 @@ from worldpose.formats.joints_file import PLURALS, JointTracks
 from worldpose.formats.release_cameras import CameraRows, read_camera
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import align
+from worldpose.ingest.match_folder import spec_around
 
 
 class Sample(NamedTuple):
@@ -221,7 +222,13 @@ def _read_people(
             keys = [key for key in PLURALS if f"{key}.npy" in file.namelist()]
         read = ", ".join(f"{key} as {PLURALS[key]}" for key in keys)
         plural = {f"{poses}": f"read {read}, as public readers name it"} if keys else {}
-    tracks = JointTracks(np.arange(count), np.arange(joints.shape[1]), joints)
+    views = None
+    if source.views is not None:
+        views = np.zeros(joints.shape[:3], np.int64)
+        views[rows] = source.views
+    tracks = JointTracks(np.arange(count), np.arange(joints.shape[1]), joints, views=views)
+    around = None if truth else spec_around(folder)
+    tracks = tracks if around is None else metrics.count_views(tracks, around[1])
     camera = wanted[0] if wanted else None
     return _People(folder, where, tracks, first, shipped, camera, tuple(used), plural)
 

@@ -48,6 +48,8 @@ class PointSource:
     """The points if the file's angles were degrees; None if they cannot be."""
     frames: Integers | None = None
     """(frames,) match frames, ascending; None if the file numbers none."""
+    views: NDArray[np.integer] | None = None
+    """(frames, persons, points), as in `JointTracks`; None if unknown."""
 
     def with_points(self, points: Floats) -> PointSource:
         """Return the same source with other points."""
@@ -296,7 +298,8 @@ def _sources(
             findings += [each for each in more if each.fault == "zeros_for_missing"]
             zeros = (tracks.joints == 0.0).all((-1, -2))
             joints = np.where(zeros[..., None, None], np.nan, tracks.joints)
-            sources.append(PointSource(name, COCO17, joints, frames=tracks.frames))
+            source = PointSource(name, COCO17, joints, frames=tracks.frames, views=tracks.views)
+            sources.append(source)
             ids = tuple(tracks.person_ids.tolist())
     for name in SUBMISSIONS:
         if (folder / name).is_file() and clip in (found := read_submission(folder / name, (clip,))):

@@ -4,6 +4,8 @@ import numpy as np
 import yaml
 
 from flows.results.dataset import count, stated_rates
+from flows.results.evaluation import reference_side, score
+from worldpose.dataset.benchmark import score_folders
 from worldpose.dataset.manifest import write_frame_rates
 from worldpose.formats.joints_file import JointTracks, write_joints
 
@@ -39,3 +41,35 @@ def test_the_rate_is_that_of_the_match_around_unless_the_folder_states_its_own(t
     assert stated_rates(tmp_path / "reference", 5.0) == {"clip": 5.0}
     write_frame_rates(tmp_path / "reference", {"clip": 50.0})
     assert stated_rates(tmp_path / "reference") == {"clip": 50.0}
+
+
+def test_people_whom_one_camera_saw_count_by_no_door_unless_the_match_has_none(tmp_path):
+    """The second of two people is 0.5 m off: she counts only where `views` are not of cameras."""
+    joints, views = standing(10, 2), np.full((10, 2, 17), 3)
+    views[:, 1] = 1
+    reference, found = tmp_path / "match" / "reference", tmp_path / "found"
+    moved = joints + [[0.01, 0.0, 0.0]]
+    moved[:, 1] += [0.5, 0.0, 0.0]
+    frames, persons = np.arange(10), np.arange(2)
+    write_joints(found / "joints.npz", JointTracks(frames, persons, moved))
+
+    def told():
+        """Persons and error [mm] by each of the ways to score."""
+        by_folder = score_folders(reference, {"found": found})[0][0].clips["clip"]
+        single = score(str(found), str(reference), "").evaluation
+        shown = [(each.persons, each.mpjpe_mm) for each in (by_folder, single)]
+        return np.array(shown)
+
+    write_joints(reference / "joints.npz", JointTracks(frames, persons, joints, views=views))
+    np.testing.assert_allclose(told(), [[1, 10.0]] * 2)
+    write_match(tmp_path / "match", "static")
+    np.testing.assert_allclose(told(), [[1, 10.0]] * 2)
+    write_match(tmp_path / "match", "broadcast")
+    np.testing.assert_allclose(told(), [[2, 260.0]] * 2)
+    assert reference_side(str(reference)).joints.views is None  # which methods are scored against
+    # Those of a broadcast camera alone, without a match that says so.
+    (tmp_path / "match" / "match.yaml").unlink()
+    for one in (0, 1):
+        shown = JointTracks(frames, persons, joints, views=np.minimum(views, one))
+        write_joints(reference / "joints.npz", shown)
+        np.testing.assert_allclose(told(), [[2, 260.0]] * 2)
