@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -89,7 +90,7 @@ class CameraView:
 
 def sample_evenly(count: int, most: int) -> Integers:
     """Return at most so many of the indices from 0 to `count` - 1, evenly spread."""
-    return np.unique(np.linspace(0, count - 1, most).round().astype(np.int64))
+    return np.linspace(0, count - 1, max(0, min(count, most))).round().astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +130,10 @@ def absent_rows(name: str, arrays: Mapping[str, NDArray[Any]]) -> tuple[Floats, 
     Returns:
         (rows, columns) bool, missing in any array or zero in all; and findings.
     """
-    flat = {key: array.reshape(*array.shape[:2], -1) for key, array in arrays.items()}
+    flat = {
+        key: array.reshape(*array.shape[:2], math.prod(array.shape[2:]))
+        for key, array in arrays.items()
+    }
     partly = {key: np.isnan(array).any(-1) for key, array in flat.items()}
     missing = np.any(list(partly.values()), axis=0)
     findings = []

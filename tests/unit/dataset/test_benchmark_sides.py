@@ -3,11 +3,13 @@
 import numpy as np
 import yaml
 
-from flows.results.dataset import count, stated_rates
+from flows.results.dataset import check, count, stated_rates
 from flows.results.evaluation import reference_side, score
+from worldpose.body.body_file import OPEN_BODY
+from worldpose.body.model import BodyParameters
 from worldpose.dataset.benchmark import score_folders
 from worldpose.dataset.manifest import write_frame_rates
-from worldpose.formats.joints_file import JointTracks, write_joints
+from worldpose.formats.joints_file import JointTracks, write_joints, write_poses
 
 
 def write_match(folder, kind):
@@ -73,3 +75,13 @@ def test_people_whom_one_camera_saw_count_by_no_door_unless_the_match_has_none(t
         shown = JointTracks(frames, persons, joints, views=np.minimum(views, one))
         write_joints(reference / "joints.npz", shown)
         np.testing.assert_allclose(told(), [[2, 260.0]] * 2)
+
+
+def test_a_clip_with_nobody_is_checked_counted_and_scored(tmp_path):
+    nobody = BodyParameters(np.zeros((0, 1, 10)), *(np.zeros((0, 5, n)) for n in (3, 69, 3)))
+    write_poses(tmp_path / "poses" / "a.npz", nobody, OPEN_BODY)
+    write_joints(tmp_path / "b.joints.npz", JointTracks(np.arange(5), np.arange(0), standing(5, 0)))
+    assert [(one.frames, one.persons) for one in check(tmp_path).clips.values()] == [(5, 0)] * 2
+    assert count([tmp_path]).poses == 0
+    (scores,), _ = score_folders(tmp_path, {"same": tmp_path})
+    assert (scores.evaluation.persons, scores.evaluation.g_mpjpe_mm) == (0, None)
