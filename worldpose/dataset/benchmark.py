@@ -300,7 +300,8 @@ def _boxes(mine: _People, truth: _People, camera: Camera) -> Floats | None:
 def _describe_shift(where: str, found: Floats, true: Floats) -> dict[str, str]:
     """Return a note if a prediction fits the reference much better some frames earlier or later."""
     errors = {}
-    for late in range(-3, 4):
+    reach = max(0, min(3, len(found) - 1))
+    for late in range(-reach, reach + 1):
         mine = found[max(late, 0) : len(found) + min(late, 0)]
         theirs = true[max(-late, 0) : len(true) - max(late, 0)]
         source, target = (metrics.paper_joints(each).reshape(-1, 3) for each in (mine, theirs))

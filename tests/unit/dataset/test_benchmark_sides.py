@@ -1,15 +1,21 @@
 """Both sides of a score by data set: what is stated around a folder, who counts, short clips."""
 
 import numpy as np
+import pytest
 import yaml
+from camera_builders import look_at_camera
 
+from data_contracts.conventions import COCO17
 from flows.results.dataset import check, count, stated_rates
 from flows.results.evaluation import reference_side, score
 from worldpose.body.body_file import OPEN_BODY
 from worldpose.body.model import BodyParameters
 from worldpose.dataset.benchmark import score_folders
+from worldpose.dataset.contents import CameraView, PointSource
 from worldpose.dataset.manifest import write_frame_rates
+from worldpose.dataset.plausibility import turning_findings
 from worldpose.formats.joints_file import JointTracks, write_joints, write_poses
+from worldpose.formats.release_cameras import CameraRows
 
 
 def write_match(folder, kind):
@@ -85,3 +91,42 @@ def test_a_clip_with_nobody_is_checked_counted_and_scored(tmp_path):
     assert count([tmp_path]).poses == 0
     (scores,), _ = score_folders(tmp_path, {"same": tmp_path})
     assert (scores.evaluation.persons, scores.evaluation.g_mpjpe_mm) == (0, None)
+
+
+@pytest.mark.parametrize("frames", [2, 3, 8])
+def test_slips_of_challenge_clips_are_found_if_they_have_the_frames(frames):
+    """Two people who part at 5 m/s, 2D of the frame before; the layout has one pose."""
+    x = 0.2 * np.arange(frames + 1)[:, None, None, None]
+    joints = standing(frames + 1, 2) + x * np.array([[-1.0], [1.0]])[:, None] * [1.0, 0.0, 0.0]
+    camera = look_at_camera((2.0, -30.0, 8.0), (4.0, 0.0, 1.0), 2000.0)
+    shown = camera.project(joints.reshape(frames + 1, -1, 3)).reshape(frames + 1, 2, 17, 2)
+    one = (
+        np.array([camera.cam_from_world.rotation]),
+        np.array([camera.cam_from_world.translation]),
+    )
+    poses = [np.concatenate([each, np.full((frames - 1, *each.shape[1:]), np.nan)]) for each in one]
+    lens = np.diag([2000.0, 2000.0, 1.0])
+    lens[:2, 2] = camera.principal_point
+    rows = CameraRows(np.tile(lens, (frames, 1, 1)), np.zeros((frames, 5)), *poses)
+    slips = []
+    for late in (0, 1):
+        view = CameraView("a", rows, shown[:frames], COCO17)
+        slips += turning_findings(PointSource("a", COCO17, joints[late : frames + late]), view)
+    assert [each.fault for each in slips] == ["frame_offset"]
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3, 8])
+def test_short_clips_are_scored_and_late_ones_are_told(tmp_path, frames):
+    """People who move 0.2 m per frame and axis, each her own way."""
+    ways = np.random.default_rng(4).normal(0.0, 0.2, (frames + 1, 2, 1, 3)).cumsum(axis=0)
+    joints, persons = standing(frames + 1, 2) + ways, np.arange(2)
+    for name, first in (("true", 1), ("same", 1), ("late", 0)):
+        some = joints[first : first + frames]
+        write_joints(
+            tmp_path / name / "a.joints.npz", JointTracks(np.arange(frames), persons, some)
+        )
+    folders = {name: tmp_path / name for name in ("same", "late")}
+    (same, late), _ = score_folders(tmp_path / "true", folders)
+    assert same.evaluation.g_mpjpe_mm == pytest.approx(0.0, abs=1e-6)
+    assert same.notes == {}
+    assert any("1 frames late" in note for note in late.notes.values()) == (frames > 1)
