@@ -296,13 +296,13 @@ def evaluate_joints(
 
     Raises:
         InputError: camera and reference have different numbers of frames, `fps` is not positive,
-            or the prediction is before or after the whole reference.
+            or the prediction has none of the reference's frames.
     """
     settings = settings or EvaluationSettings()
     if fps is not None:
         row_rate("evaluate_joints", fps)
     sides = prediction.frames, reference.frames
-    if all(map(len, sides)) and max(map(np.min, sides)) > min(map(np.max, sides)):
+    if all(map(len, sides)) and not len(np.intersect1d(*sides)):
         own, wanted = (f"{frames.min()} to {frames.max()}" for frames in sides)
         raise InputError(
             "frames of the prediction",
