@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -222,11 +223,11 @@ def _read_people(
             keys = [key for key in PLURALS if f"{key}.npy" in file.namelist()]
         read = ", ".join(f"{key} as {PLURALS[key]}" for key in keys)
         plural = {f"{poses}": f"read {read}, as public readers name it"} if keys else {}
-    views = None
+    tracks = JointTracks(np.arange(count), np.arange(joints.shape[1]), joints)
     if source.views is not None:
-        views = np.zeros(joints.shape[:3], np.int64)
-        views[rows] = source.views
-    tracks = JointTracks(np.arange(count), np.arange(joints.shape[1]), joints, views=views)
+        seen = np.zeros(joints.shape[:3], np.int64)
+        seen[rows] = source.views
+        tracks = replace(tracks, views=seen)
     around = None if truth else spec_around(folder)
     tracks = tracks if around is None else metrics.count_views(tracks, around[1])
     camera = wanted[0] if wanted else None
