@@ -122,6 +122,8 @@ def _before_and_after(
     )
     joints = tracks.joints[np.searchsorted(tracks.frames, both)]
     shared = JointTracks(both, tracks.person_ids, joints)
+    if not joints.size:
+        return []
     place, person = largest_pose_changes(before, after, shared)
     number = int(both[place])
     (detected,) = _seen_in(run, view)

@@ -54,6 +54,12 @@ def clip_pictures(
     tracks = joint_tracks(run, clip)
     pitch = shown_pitch(run, match)
     seen = placed_joints(run, clip)["inliers"].any("joint").sum("person").values
+    if truth is not None:
+        spec = match.folder.spec.clip(clip)
+        here = (truth.frames >= spec.first_frame) & (
+            truth.frames < spec.first_frame + spec.frame_count
+        )
+        truth = JointTracks(truth.frames[here], truth.person_ids, truth.joints[here])
     pictures = []
     if len(tracks.frames):
         first = int(tracks.frames[0])

@@ -14,12 +14,7 @@ from worldpose.body.body_file import OPEN_BODY, find_body
 from worldpose.body.model import BodyModel
 from worldpose.dataset.check import check_clip
 from worldpose.dataset.contents import camera_files, list_clips, read_clip
-from worldpose.dataset.manifest import (
-    changed_files,
-    clip_frame_rate,
-    read_frame_rates,
-    read_manifest,
-)
+from worldpose.dataset.manifest import changed_files, read_manifest, stated_rate
 from worldpose.dataset.statistics import (
     camera_kind,
     clip_statistics,
@@ -41,8 +36,7 @@ def stated_rates(folder: Path, fps: float | None = None) -> dict[str, float | No
     """
     clips, manifest = list_clips(folder), read_manifest(folder)
     said = fps or (None if manifest is None else manifest.fps)
-    rates = read_frame_rates(folder)
-    return {clip: said or clip_frame_rate(rates, clip) for clip in clips}
+    return {clip: said or stated_rate(folder, clip) for clip in clips}
 
 
 def check(

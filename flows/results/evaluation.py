@@ -13,7 +13,7 @@ from flows.registering import find_match
 from flows.results.best_results import clips_of, describe_age, joint_tracks, open_results
 from flows.results.run_cameras import broadcast_cameras, static_cameras
 from worldpose.dataset.benchmark import require_one_rate
-from worldpose.dataset.manifest import clip_frame_rate, read_frame_rates
+from worldpose.dataset.manifest import stated_rate
 from worldpose.errors import InputError, UsageError
 from worldpose.evaluation.cameras import CameraScore, evaluate_cameras
 from worldpose.evaluation.marker_reference import (
@@ -25,12 +25,12 @@ from worldpose.evaluation.marker_reference import (
     read_marker_map,
     read_markers,
 )
-from worldpose.evaluation.metrics import PersonScore, evaluate_joints
+from worldpose.evaluation.metrics import PersonScore, count_views, evaluate_joints
 from worldpose.evaluation.position_reference import align_positions
 from worldpose.formats.joints_file import JointTracks, read_joints
 from worldpose.formats.release_cameras import read_camera
 from worldpose.geometry.cameras import Camera
-from worldpose.ingest.match_folder import MatchFolder, read_spec
+from worldpose.ingest.match_folder import MatchFolder, spec_around
 from worldpose.ingest.pitch_file import read_pitch
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.runs import LATEST
@@ -124,9 +124,8 @@ def score(
         mine, tracks, notes = align_positions(Path(reference), estimate.joints, first, known)
         estimate, truth = replace(estimate, joints=mine), Side(tracks, {})
     spec = None if match is None else match.spec
-    is_broadcast = estimate.match is not None and not estimate.match.spec.static_cameras
-    if is_broadcast and truth.joints is not None:  # `views` counts static cameras
-        truth = replace(truth, joints=replace(truth.joints, views=None))
+    if estimate.match is not None and truth.joints is not None:
+        truth = replace(truth, joints=count_views(truth.joints, estimate.match.spec))
     true_cameras = cameras_of(reference, truth, spec)
     if match_in is not None and match_in not in true_cameras:
         raise UsageError(
@@ -201,21 +200,21 @@ def reference_side(name: str) -> Side:
         InputError: there is no such file, or it has the wrong format.
     """
     path = Path(name)
-    above = [folder for folder in path.resolve().parents[:2] if (folder / "match.yaml").is_file()]
     match = None
-    if above:  # without its videos, which may be gone
-        spec = read_spec(above[0])
-        match = MatchFolder(above[0], spec, {}, {}, read_pitch(above[0], spec), {}, {}, {}, {})
+    if around := spec_around(path):  # without its videos, which may be gone
+        match = MatchFolder(*around, {}, {}, read_pitch(*around), {}, {}, {}, {})
     folder = path if path.is_dir() else path.parent
     clip = path.name.removesuffix(".npz").removesuffix(".joints")
-    rate = clip_frame_rate(read_frame_rates(folder), clip)
-    rate = match.spec.fps if rate is None and match is not None else rate
+    rate = stated_rate(folder, clip)
     files = sorted((path / "cameras").glob("*.npz"))
     if path.is_dir() and files:
-        joints = read_joints(path / "joints.npz") if (path / "joints.npz").is_file() else None
+        joints = load_reference(name) if (path / "joints.npz").is_file() else None
         cameras = {file.stem: read_camera(file) for file in files}
-        return Side(joints, cameras, match, fps=rate)
-    return Side(load_reference(name), {}, match, fps=rate)
+    else:
+        joints, cameras = load_reference(name), {}
+    if joints is not None and around:
+        joints = count_views(joints, around[1])
+    return Side(joints, cameras, match, fps=rate)
 
 
 def is_of_files(name: str) -> bool:

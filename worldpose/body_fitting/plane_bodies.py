@@ -265,8 +265,10 @@ class _Clip:
             )
             low = np.where(seen, ankles[..., 2] - floor - height, np.inf).min(axis=1)
             low[~seen.any(axis=1)] = np.nan
+            _, given, weight = self._sight(person, rows, evidence.fps)
+            given = np.nan_to_num(np.linalg.norm((given - center)[:, :2], axis=-1))
             found, variance = find_standing_distance(
-                distance + low / slope, slope, evidence.fps, settings.contact_std_m
+                distance + low / slope, slope, evidence.fps, settings.contact_std_m, given, weight
             )
             new = hips + (found - distance)[:, None] * sight
             moved[person] = replace(own, place=new)
@@ -328,16 +330,11 @@ class _Clip:
         variance *= settings.repeated(fps)
         by_ray = np.where(seen[..., None, None], across / variance[..., None, None], 0.0)
 
-        sight, place = self._sight(person, rows)
-        spread = np.einsum(
-            "fa,fab,fb->f", sight[:, :2], evidence.place_covariance[rows, person], sight[:, :2]
-        )
-        known = np.isfinite(spread)
-        # Two hips share the distance.
-        weight = 0.5 / (np.where(known, spread, 1.0) * (1.0 + PLACE_CORRELATION_S * fps)) * known
+        sight, place, weight = self._sight(person, rows, fps)
         by_place = np.zeros_like(by_ray)
         outer = np.nan_to_num(sight[:, :, None] * sight[:, None])
-        by_place[:, COCO17_HIPS] = (weight[:, None, None] * outer)[:, None]
+        # Two hips share the distance.
+        by_place[:, COCO17_HIPS] = (0.5 * weight[:, None, None] * outer)[:, None]
         joints = np.where(seen[..., None], points, np.nan)
         hips = joints[:, COCO17_HIPS]
         target = np.broadcast_to(place[:, None], hips.shape)
@@ -351,14 +348,22 @@ class _Clip:
         information[~np.isfinite(joints).all(axis=-1)] = 0.0
         return PersonEvidence(joints, information)
 
-    def _sight(self, person: int, rows: NDArray[np.int64]) -> tuple[Floats, Floats]:
-        """Return the horizontal directions of sight (rows, 3) and the places (rows, 3) [m]."""
+    def _sight(
+        self, person: int, rows: NDArray[np.int64], fps: float
+    ) -> tuple[Floats, Floats, Floats]:
+        """Return the horizontal directions of sight (rows, 3), places (rows, 3) [m], and weights.
+
+        A weight (rows,) [1/m^2] is the information along the line of sight; 0 without a place.
+        """
         xy = self.evidence.place[rows, person]
         assert self.solver.ground is not None
         place = np.concatenate([xy, self.solver.ground(xy[:, 0], xy[:, 1])[:, None]], axis=1)
         sight = place - self.evidence.camera[rows].center
         sight[:, 2] = 0.0
-        return sight / np.linalg.norm(sight, axis=-1, keepdims=True), place
+        sight /= np.linalg.norm(sight, axis=-1, keepdims=True)
+        covariance = self.evidence.place_covariance[rows, person]
+        spread = np.einsum("fa,fab,fb->f", sight[:, :2], covariance, sight[:, :2])
+        return sight, place, np.nan_to_num(1.0 / (spread * (1.0 + PLACE_CORRELATION_S * fps)))
 
     def sample_pieces(self, person: int, own: _Person) -> list[Piece]:
         """Return intervals of a person's track for shape estimation, with initial bodies."""
@@ -395,7 +400,7 @@ class _Clip:
             joints: (frames, 17, 3) [m], world, in the frames of the span.
         """
         rows = np.arange(own.span.start, own.span.stop)
-        sight, place = self._sight(person, rows)
+        sight, place, _ = self._sight(person, rows, self.evidence.fps)
         centers = self.evidence.camera[rows].center
         offset = place - centers
         slope = -offset[:, 2] / np.linalg.norm(offset[:, :2], axis=-1)

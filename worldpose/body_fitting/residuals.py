@@ -7,7 +7,7 @@ P_tj(theta, t, beta) of the body, and second differences D_tj = P_t+2,j - 2 P_t+
                + E_shape + E_offset
 
     E_data      = sum_tj rho(r_tj^T W_tj r_tj; loss_scale^2),   r_tj = P_tj + A_t o_j - X_tj
-    E_smooth    = sum_tj rho(|D_tj|^2 / s_j^2; 3 acceleration_loss_scale^2)
+    E_smooth    = min(1, 120 / fps) sum_tj rho(|D_tj|^2 / s_j^2; 3 acceleration_loss_scale^2)
     E_slip      = 1/2 sum |P_t+1,j - P_tj|^2 / slip_std^2       over standing ankles
     E_contact   = 1/2 sum (z_tj - h_tj)^2 / contact_std^2       over standing and sunken ankles
     E_pose      = 1/2 pose_weight sum_t (theta_t - mu)^T Lambda (theta_t - mu)
@@ -164,8 +164,9 @@ class PersonObjective:
         sums = PointSums.empty(frames, count)
         tied = bool(np.isfinite(self.acceleration)) or self.contacts is not None
         if tied:
-            std = self.acceleration * acceleration_scale(count) / self.fps**2
-            tail = 3.0 * given.acceleration_loss_scale**2
+            share = given.smooth_weight(self.fps)
+            std = self.acceleration * acceleration_scale(count) / self.fps**2 / share**0.5
+            tail = 3.0 * given.acceleration_loss_scale**2 * share
             add_smoothness(sums, body.keypoints, std, tail, self.starts)
         if self.contacts is not None:
             add_slip(sums, body.keypoints, self.contacts, given.slip_std_m)

@@ -9,8 +9,8 @@ true distance,
 
 Standing feet have a lift l_t of 0; others seem farther away, never nearer. The likelihood of
 d_t - x_t is a mixture: the error e_t is normal, and l_t is 0 or exponential. A constant velocity
-with normal accelerations ties the frames. The maximum is found by expectation-maximization from
-the start at which every foot stands.
+with normal accelerations ties the frames. The given place is the mean of x_t before any ankle is
+seen. The maximum is found by expectation-maximization from the start at which every foot stands.
 """
 
 from __future__ import annotations
@@ -37,7 +37,12 @@ LIFT_M: Final = 0.1
 
 
 def find_standing_distance(
-    distance: Floats, slope: Floats, fps: float, height_std_m: float
+    distance: Floats,
+    slope: Floats,
+    fps: float,
+    height_std_m: float,
+    place: Floats,
+    information: Floats,
 ) -> tuple[Floats, Floats]:
     """Return the distance of a person (frames,) [m], and its variance (frames,) [m^2].
 
@@ -46,6 +51,8 @@ def find_standing_distance(
         slope: (frames,) fall of the line of sight per horizontal metre [1].
         fps: frames per second [1/s].
         height_std_m: standard deviation of a standing ankle's height [m].
+        place: (frames,) [m], the distance that is given.
+        information: (frames,) [1/m^2], inverse variance of `place`; 0 where unknown.
     """
     motion, frames = Motion.at(fps), len(distance)
     known = np.isfinite(distance)
@@ -63,9 +70,10 @@ def find_standing_distance(
     for _ in range(12):
         weight = standing / (variance * motion.inflation)
         system = blocks.copy()
-        system[0, :, 0, 0] += weight + 1e-6
+        system[0, :, 0, 0] += weight + information
         factor_ = BandedFactor.of(system)
-        found = factor_.solve((weight * seen)[:, None, None])[:, 0, 0]
+        total = weight * seen + information * place
+        found = factor_.solve(total[:, None, None])[:, 0, 0]
         spread = factor_.inverse_blocks()[:, 0, 0]
         away, std = seen - found, np.sqrt(variance)
         stands = -0.5 * away**2 / variance - np.log(std * np.sqrt(2.0 * np.pi))

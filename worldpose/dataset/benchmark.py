@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -17,7 +18,7 @@ from worldpose.body.model import BodyModel
 from worldpose.dataset.check import check_clip
 from worldpose.dataset.contents import SUBMISSIONS, ShippedClip, camera_files, list_clips, read_clip
 from worldpose.dataset.faults import LIMITS, camera_faults
-from worldpose.dataset.manifest import FRAME_RATES, clip_frame_rate, read_frame_rates
+from worldpose.dataset.manifest import FRAME_RATES, stated_rate
 from worldpose.errors import InputError
 from worldpose.evaluation import matching, metrics
 from worldpose.formats.archives import ARRAY_BYTES, read_npz, wrong
@@ -25,6 +26,7 @@ from worldpose.formats.joints_file import PLURALS, JointTracks
 from worldpose.formats.release_cameras import CameraRows, read_camera
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import align
+from worldpose.ingest.match_folder import spec_around
 
 
 class Sample(NamedTuple):
@@ -124,14 +126,14 @@ def score_folders(
     for clip, part in parts_of_clips(reference).items():
         truth = _read_people(part, clip, body, match_in)
         true, camera = truth.tracks.joints, _true_camera(truth)
-        stated = clip_frame_rate(read_frame_rates(part), clip)
+        stated = stated_rate(part, clip)
         shown = {}
         for name, folder in predictions.items():
             if clip not in parts[name]:
                 todo = "Write its poses, with NaN where the method found no person."
                 found = ", ".join(parts[name])
                 raise wrong(f"{folder}: clip {clip}", f"poses/{clip}.npz or joints", found, todo)
-            own = clip_frame_rate(read_frame_rates(parts[name][clip]), clip)
+            own = stated_rate(parts[name][clip], clip)
             require_one_rate({f"{part}": stated, f"{parts[name][clip]}": own})
             mine = _read_people(parts[name][clip], clip, body, match_in, truth)
             boxes = None if camera is None else _boxes(mine, truth, camera)
@@ -222,6 +224,12 @@ def _read_people(
         read = ", ".join(f"{key} as {PLURALS[key]}" for key in keys)
         plural = {f"{poses}": f"read {read}, as public readers name it"} if keys else {}
     tracks = JointTracks(np.arange(count), np.arange(joints.shape[1]), joints)
+    if source.views is not None:
+        seen = np.zeros(joints.shape[:3], np.int64)
+        seen[rows] = source.views
+        tracks = replace(tracks, views=seen)
+    around = None if truth else spec_around(folder)
+    tracks = tracks if around is None else metrics.count_views(tracks, around[1])
     camera = wanted[0] if wanted else None
     return _People(folder, where, tracks, first, shipped, camera, tuple(used), plural)
 
@@ -293,7 +301,8 @@ def _boxes(mine: _People, truth: _People, camera: Camera) -> Floats | None:
 def _describe_shift(where: str, found: Floats, true: Floats) -> dict[str, str]:
     """Return a note if a prediction fits the reference much better some frames earlier or later."""
     errors = {}
-    for late in range(-3, 4):
+    reach = max(0, min(3, len(found) - 1))
+    for late in range(-reach, reach + 1):
         mine = found[max(late, 0) : len(found) + min(late, 0)]
         theirs = true[max(-late, 0) : len(true) - max(late, 0)]
         source, target = (metrics.paper_joints(each).reshape(-1, 3) for each in (mine, theirs))

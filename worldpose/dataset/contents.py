@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -48,6 +49,8 @@ class PointSource:
     """The points if the file's angles were degrees; None if they cannot be."""
     frames: Integers | None = None
     """(frames,) match frames, ascending; None if the file numbers none."""
+    views: NDArray[np.integer] | None = None
+    """(frames, persons, points), as in `JointTracks`; None if unknown."""
 
     def with_points(self, points: Floats) -> PointSource:
         """Return the same source with other points."""
@@ -87,7 +90,7 @@ class CameraView:
 
 def sample_evenly(count: int, most: int) -> Integers:
     """Return at most so many of the indices from 0 to `count` - 1, evenly spread."""
-    return np.unique(np.linspace(0, count - 1, most).round().astype(np.int64))
+    return np.linspace(0, count - 1, max(0, min(count, most))).round().astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +130,10 @@ def absent_rows(name: str, arrays: Mapping[str, NDArray[Any]]) -> tuple[Floats, 
     Returns:
         (rows, columns) bool, missing in any array or zero in all; and findings.
     """
-    flat = {key: array.reshape(*array.shape[:2], -1) for key, array in arrays.items()}
+    flat = {
+        key: array.reshape(*array.shape[:2], math.prod(array.shape[2:]))
+        for key, array in arrays.items()
+    }
     partly = {key: np.isnan(array).any(-1) for key, array in flat.items()}
     missing = np.any(list(partly.values()), axis=0)
     findings = []
@@ -296,7 +302,8 @@ def _sources(
             findings += [each for each in more if each.fault == "zeros_for_missing"]
             zeros = (tracks.joints == 0.0).all((-1, -2))
             joints = np.where(zeros[..., None, None], np.nan, tracks.joints)
-            sources.append(PointSource(name, COCO17, joints, frames=tracks.frames))
+            source = PointSource(name, COCO17, joints, frames=tracks.frames, views=tracks.views)
+            sources.append(source)
             ids = tuple(tracks.person_ids.tolist())
     for name in SUBMISSIONS:
         if (folder / name).is_file() and clip in (found := read_submission(folder / name, (clip,))):

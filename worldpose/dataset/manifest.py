@@ -20,6 +20,7 @@ from worldpose.errors import InputError
 from worldpose.formats.archives import write_archive
 from worldpose.formats.files import whole_file
 from worldpose.formats.joints_file import JointTracks
+from worldpose.ingest.match_folder import spec_around
 
 MANIFEST: Final = "manifest.json"
 DATA_SET: Final = "release.json"
@@ -150,6 +151,17 @@ def clip_frame_rate(rates: Mapping[str, float], clip: str) -> float | None:
     if clip in rates:
         return rates[clip]
     return next(iter(rates.values())) if len(set(rates.values())) == 1 else None
+
+
+def stated_rate(folder: Path, clip: str) -> float | None:
+    """Return the frame rate of a clip [1/s] that the folder states, or else match.yaml around it.
+
+    Raises:
+        InputError: one of both files is invalid.
+    """
+    rate = clip_frame_rate(read_frame_rates(folder), clip)
+    around = spec_around(folder) if rate is None else None
+    return rate if around is None else around[1].fps
 
 
 ORIGINS: Final = ("absent", "automatic", "filled", "corrected")

@@ -25,7 +25,7 @@ from worldpose.dataset.faults import (
     point_faults,
 )
 from worldpose.formats.release_cameras import CameraRows
-from worldpose.geometry.rigid import unit
+from worldpose.geometry.rigid import align, unit
 
 BONES = {
     "upper arms": ("shoulder", "elbow"),
@@ -357,7 +357,7 @@ def _left(seen: Floats, points: Floats, rows: CameraRows, late: int) -> float:
     max_frames = 150
     # Minimum number of points of a frame for a rotation estimate: more than one person.
     min_points = 30
-    for frame in np.unique(np.linspace(first, last - 1, max_frames).round().astype(np.int64)):
+    for frame in first + sample_evenly(last - first, max_frames):
         here, there = seen[frame].reshape(-1, 2), points[frame + late].reshape(-1, 3)
         plane = camera[int(frame)].normalize(here)
         known = np.isfinite(plane).all(-1) & np.isfinite(there).all(-1)
@@ -366,15 +366,10 @@ def _left(seen: Floats, points: Floats, rows: CameraRows, late: int) -> float:
         plane = plane[known]
         rays = unit(np.concatenate([plane, np.ones((len(plane), 1))], axis=1))
         ways = unit(there[known] - center)
-        turned = ways @ _turn(ways, rays).T
+        # With their opposites, directions are turned about the camera alone.
+        both = (np.concatenate([each, -each]) for each in (ways, rays))
+        turned = ways @ align(*both, with_scale=False).rotation.T
         ahead = turned[:, 2:] > 0.0
         away = np.where(ahead, turned[:, :2] / np.where(ahead, turned[:, 2:], 1.0) - plane, np.inf)
         errors.append(np.linalg.norm(away * camera.focal[frame], axis=-1))
     return float(np.median(np.concatenate(errors))) if errors else np.inf
-
-
-def _turn(ways: Floats, rays: Floats) -> Floats:
-    """Return the rotation (3, 3) that best aligns unit vectors (n, 3) with others."""
-    u, _, vt = np.linalg.svd(rays.T @ ways)
-    straight = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))])
-    return np.asarray(u @ straight @ vt)

@@ -106,6 +106,8 @@ def camera_kind(path: Path) -> CameraKind | None:
         InputError: the file is damaged.
     """
     rows = read_camera_rows(path)
+    if len(rows.rotation) == 1 and np.isfinite(rows.rotation).all():  # one row holds throughout
+        return "S"
     return kind_of(rows.intrinsics[:, (0, 1), (0, 1)].mean(-1), rows.rotation)
 
 
@@ -119,10 +121,10 @@ def kind_of(focal: Floats, rotation: Floats) -> CameraKind | None:
     if known.any() and np.ptp(focal[known]) > zoom * focal[known].mean():
         return "M+Z"
     turns = rotation[np.isfinite(rotation).all((-1, -2))]
-    if len(turns) < 2 <= len(focal):
+    if len(turns) < 2:
         return None
     # The angle of R1^T R2 is below a when the trace is above 1 + 2 cos a.
-    traces = np.einsum("fab,ab->f", turns, turns[0]) if len(turns) else np.empty(0)
+    traces = np.einsum("fab,ab->f", turns, turns[0])
     # Maximum rotation of a static camera [rad]: a pixel in a broadcast image.
     max_turn_rad = 1e-3
     return "M" if (traces < 1.0 + 2.0 * np.cos(max_turn_rad)).any() else "S"

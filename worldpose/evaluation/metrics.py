@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.evaluation import Evaluation
+from data_contracts.match import MatchSpec
 from data_contracts.records import Record
 from worldpose.errors import InputError
 from worldpose.evaluation.matching import (
@@ -262,6 +263,12 @@ def pool_people(
     )
 
 
+def count_views(reference: JointTracks, match: MatchSpec | None) -> JointTracks:
+    """Return true joints for scores: without `views` if the match has no static camera."""
+    dropped = match is not None and not match.static_cameras
+    return replace(reference, views=None) if dropped else reference
+
+
 def evaluate_joints(
     prediction: JointTracks,
     reference: JointTracks,
@@ -289,13 +296,13 @@ def evaluate_joints(
 
     Raises:
         InputError: camera and reference have different numbers of frames, `fps` is not positive,
-            or the prediction is before or after the whole reference.
+            or the prediction has none of the reference's frames.
     """
     settings = settings or EvaluationSettings()
     if fps is not None:
         row_rate("evaluate_joints", fps)
     sides = prediction.frames, reference.frames
-    if all(map(len, sides)) and max(map(np.min, sides)) > min(map(np.max, sides)):
+    if all(map(len, sides)) and not len(np.intersect1d(*sides)):
         own, wanted = (f"{frames.min()} to {frames.max()}" for frames in sides)
         raise InputError(
             "frames of the prediction",
@@ -385,7 +392,9 @@ def _counting_joints(reference: JointTracks, settings: EvaluationSettings) -> Fl
     exists = np.isfinite(reference.joints[..., 0])
     counts = exists
     if reference.views is not None:
-        counts = counts & (reference.views >= settings.min_views)
+        seen = reference.views >= settings.min_views
+        # Nowhere enough: a broadcast camera's, which only tell what it shows.
+        counts = exists & seen if seen.any() else exists
     enough = counts.sum(-1) >= settings.min_joint_share * exists.sum(-1)
     return np.asarray(counts & enough[..., None])
 

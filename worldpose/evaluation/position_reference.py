@@ -112,7 +112,10 @@ def align_positions(
     numbers, names, given, rate = read_positions(path)
     usual = (25.0, 10.0, 50.0, 30.0, 20.0, 12.5, 5.0, 60.0)
     rates = (rate,) if np.isfinite(rate) else usual
-    ratios = {own / each for own in ((fps,) if fps else usual) for each in rates}
+    owns = {fps} if fps else {*usual}
+    if fps and not np.isfinite(rate) and abs(fps - round(fps)) < 2e-3 * fps:
+        owns.add(float(round(fps)))  # 59.94 to 29.97 is 2 to 1, as 60 to 30 is
+    ratios = {own / each for own in owns for each in rates}
     # A rate by a coarse clock may be wrong by a frame over the file.
     likely = fps / rate if fps and abs(fps / rate - 1.0) * np.ptp(numbers) > 1.0 else 1.0
     steps = sorted({1.0 if abs(step - 1.0) < 5e-4 else step for step in ratios} | {1.0})
@@ -163,7 +166,9 @@ def align_positions(
     notes = [f"people: {{{', '.join(said)}}}"]
     alike = 0.05  # distances of two rates that tell nothing [m]
     likewise = [each for each in tried if tried[each][0][0] <= max(2.0 * best, alike)]
-    if not np.isfinite(rate) and len(likewise) > 1:
+    # Rates that differ by a frame over the file at most are one.
+    apart_by = max(abs(each - step) for each in likewise) * np.ptp(numbers)
+    if not np.isfinite(rate) and apart_by > 1.0:
         told = "warning: the positions have no times, and people move too little to tell their rate"
         notes.insert(0, f"{told}; one frame of theirs is taken as {step:g} of the match")
     if step != 1.0:

@@ -160,6 +160,19 @@ def read_spec(folder: Path) -> MatchSpec:
         return _read_spec(folder)
 
 
+def spec_around(path: Path) -> tuple[Path, MatchSpec] | None:
+    """Return the match folder that holds a file or folder of results, and its match.yaml.
+
+    Raises:
+        InputError: match.yaml is invalid.
+    """
+    whole = path.resolve()
+    for folder in (whole, *whole.parents[:2]):
+        if (folder / "match.yaml").is_file():
+            return folder, read_spec(folder)
+    return None
+
+
 def _read_spec(folder: Path) -> MatchSpec:
     file = folder / "match.yaml"
     if folder.is_dir() and not file.exists():

@@ -144,12 +144,15 @@ def plot_stadium(
     Shading shows the ground in each single camera's field of view, on and near the pitch if there
     is one: the more cameras see a place, the darker it is.
     """
-    hips = tracks.joints[0][:, COCO17_HIPS, :2].mean(axis=1)
+    joints = tracks.joints[0] if len(tracks.frames) else np.full(tracks.joints.shape[1:], np.nan)
+    hips = joints[:, COCO17_HIPS, :2].mean(axis=1)
     places = [camera.center[None, :2] for camera in cameras.values()] + [hips]
     if pitch is not None:
         places.append(pitch_corners(pitch))
     everything = np.concatenate(places)
     everything = everything[np.isfinite(everything[:, 0])]
+    if not len(everything):
+        everything = np.zeros((1, 2))
     low, high = everything.min(axis=0) - 8.0, everything.max(axis=0) + np.array([14.0, 8.0])
     proportion = float((high - low)[1] / (high - low)[0])
     figure = Figure(figsize=(14.0, 14.0 * proportion + 0.8), dpi=110, facecolor="white")

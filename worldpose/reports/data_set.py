@@ -218,8 +218,10 @@ def plot_methods(sample: Sample) -> bytes:
 
     corners = []
     for points in views(sample.true.reshape(-1, 3)):
-        low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-        room = 0.08 * float((high - low).max())
+        known = points[np.isfinite(points).all(axis=-1)]
+        known = known if len(known) else np.array([[-1.0, -1.0], [1.0, 1.0]])  # nobody is true
+        low, high = known.min(axis=0), known.max(axis=0)
+        room = max(0.08 * float((high - low).max()), 1e-3)
         corners.append((low - room, high + room))
     heights = [4.2 * min((high - low)[1] / (high - low)[0], 1.0) for low, high in corners]
     size = (4.6 * max(count, 2), sum(heights) + 1.8)

@@ -233,6 +233,28 @@ def track():
     return made, pose
 
 
+def test_one_motion_is_smoothed_alike_at_rates_above_120():
+    """One second of one motion, without joints: E_smooth alone differs without accelerations."""
+    truth = walker(241, np.random.default_rng(2), fps=240.0)
+    costs = {}
+    for fps, every in ((240.0, 1), (120.0, 2), (60.0, 4)):
+        some = truth[::every]
+        pose = Pose(some.transl, some.global_orient, some.body_pose @ GATHER.T, truth.betas[0])
+        none = np.full((len(some.transl), 17, 3), np.nan), np.ones((len(some.transl), 17, 3, 3))
+        own = PersonEvidence.of(*none, fps, SETTINGS)
+        chained = ChainedKeypoints.of(KEYPOINTS)
+        both = [
+            PersonObjective(chained, own, load_pose_prior(), SETTINGS, fps, each, 0.03)
+            .equations(pose, np.zeros((17, 3)), bordered=False)
+            .cost
+            for each in (20.0, np.inf)
+        ]
+        costs[fps] = both[0] - both[1]
+    assert costs[240.0] == pytest.approx(costs[120.0], rel=0.05)
+    # At usual rates each frame counts.
+    assert costs[60.0] == pytest.approx(0.5 * costs[120.0], rel=0.05)
+
+
 def test_gradient_by_frames_and_betas_agrees_with_finite_differences(track):
     made, pose = track
     rng = np.random.default_rng(1)

@@ -32,7 +32,7 @@ from worldpose.dataset.manifest import (
     write_manifest,
     write_origins,
 )
-from worldpose.dataset.statistics import clip_statistics
+from worldpose.dataset.statistics import camera_kind, clip_statistics, kind_of
 from worldpose.errors import InputError, UsageError
 from worldpose.evaluation.metrics import evaluate_joints
 from worldpose.formats.archives import write_archive
@@ -194,6 +194,16 @@ def test_a_folder_without_a_manifest_has_none_and_another_contract_is_refused(tm
     path.write_text(json.dumps({name: fields[name] for name in fields if name != "usability"}))
     with pytest.raises(InputError, match=r"usability: Field required: another version.*again with"):
         read_manifest(tmp_path)
+
+
+def test_one_pose_does_not_tell_a_static_camera_but_a_file_of_one_row_does(tmp_path):
+    camera = panning(2, 3000.0, 0.0)
+    one, two = (
+        kind_of(each.focal[:, 0], each.cam_from_world.rotation) for each in (camera[:1], camera)
+    )
+    assert (one, two) == (None, "S")
+    write_moving_camera(tmp_path / "a.npz", camera[:1])
+    assert camera_kind(tmp_path / "a.npz") == "S"
 
 
 def test_origins_tell_absent_automatic_filled_and_corrected_joints(tmp_path):

@@ -275,6 +275,24 @@ def test_the_rate_is_that_within_periods_in_any_unit_of_frames(
     assert read_positions(tmp_path / "a.csv")[3] == pytest.approx(rate)
 
 
+def test_places_of_29_97_rows_a_second_without_times_stay_with_a_match_of_59_94(tmp_path):
+    """1.998 frames to a row, as of 30, would be off by 3.4 frames of 0.1 m at the end."""
+    x = 20.0 * np.sin(np.arange(3401) / 200.0)
+    mine, _ = tracks()
+    joints = np.tile(mine.joints[:1], (3401, 1, 1, 1))
+    joints[..., 0] += x[:, None, None]
+    mine = JointTracks(np.arange(3401), mine.person_ids, joints)
+    places = joints[::2][:, :, 11:13, :2].mean(axis=2)
+    (tmp_path / "positions.csv").write_text(wide(places, first=0))
+    predicted, given, notes = align_positions(tmp_path / "positions.csv", mine, fps=59.94)
+    assert notes[0].startswith("each frame of the positions is 2 frames")
+    scores, _ = evaluate_joints(predicted, given, fps=59.94)
+    assert scores.mpjpe_mm == pytest.approx(0.0, abs=1.0)
+    (tmp_path / "positions.csv").write_text(wide(places[:200], first=0))
+    _, _, notes = align_positions(tmp_path / "positions.csv", mine, fps=59.94)
+    assert not any("warning" in note for note in notes)
+
+
 def test_people_who_hardly_move_do_not_tell_the_rate_of_places_without_times(tmp_path):
     mine, places = tracks()
     mine = JointTracks(mine.frames - 100, mine.person_ids, np.tile(mine.joints[:1], (30, 1, 1, 1)))

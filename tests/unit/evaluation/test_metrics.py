@@ -107,12 +107,14 @@ def test_frames_are_paired_by_number():
     assert (beyond.frames, beyond.coverage, beyond.false_persons_per_frame) == (4, 1.0, 0.0)
 
 
-def test_frames_of_another_clip_are_refused_and_those_between_sparse_labels_score_nothing():
+def test_frames_of_another_clip_or_between_sparse_labels_are_refused():
     truth = crowd()
     sparse = JointTracks(30 * truth.frames, truth.person_ids, truth.joints)
     between = JointTracks(31 + truth.frames, truth.person_ids, truth.joints)
-    scores = score(between, sparse)
-    assert (scores.coverage, scores.idf1, scores.mpjpe_mm, scores.frames) == (0.0, 0.0, None, 4)
+    with pytest.raises(InputError, match="some of 0 to 90, found 31 to 34, none in common"):
+        score(between, sparse)
+    one = JointTracks(30 + truth.frames, truth.person_ids, np.roll(truth.joints, -1, axis=0))
+    assert score(one, sparse).coverage == 0.25
     later = JointTracks(truth.frames + 1000, truth.person_ids, truth.joints)
     with pytest.raises(InputError, match="which has some of 0 to 3, found 1000 to 1003, none in"):
         score(later, truth)

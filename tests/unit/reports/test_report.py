@@ -9,10 +9,12 @@ import sys
 from datetime import timedelta
 from html import unescape
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
+import xarray as xr
 from camera_builders import look_at_camera, plain_camera
 from matplotlib.figure import Figure
 from run_records import AT, run_record
@@ -21,15 +23,20 @@ from data_contracts.conventions import COCO17, COCO17_BONES
 from data_contracts.evaluation import CameraErrors, CameraEvaluation, Evaluation
 from data_contracts.pitch import PitchSpec
 from data_contracts.run import UnitFailure
+from flows.reports import clips
 from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BodyParameters
+from worldpose.dataset.benchmark import Sample
 from worldpose.errors import UsageError
 from worldpose.formats.joints_file import JointTracks
 from worldpose.formats.tables import Positions
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.reports.bodies import BodyTracks
+from worldpose.reports.broadcast import largest_pose_changes
+from worldpose.reports.clips import plot_stadium
+from worldpose.reports.data_set import plot_methods
 from worldpose.reports.drawing import figure_data, note_undrawn_distortion, write_figure
 from worldpose.reports.html_page import CaptionedImage, EmbeddedPage, LinkedFile, Section
 from worldpose.reports.rerun_recording import write_recording
@@ -368,3 +375,45 @@ def test_people_are_drawn_at_their_places_and_in_the_way_of_their_kind():
     assert np.abs(colour(first, 20.0, 10.0) - grass).max() > 50  # a disc is filled
     np.testing.assert_array_equal(colour(first, -20.0, -10.0), grass)  # a ring is not
     assert np.abs(colour(first, -20.8, -10.0) - grass).max() > 50
+
+
+def test_pictures_of_nobody_are_drawn():
+    """No frame, no person, nobody who is true: each is a picture, or the first indices."""
+    empty = tracks(3)
+    nobody = JointTracks(empty.frames, np.zeros(0, int), np.zeros((3, 0, 17, 3)))
+    never = JointTracks(np.zeros(0, int), empty.person_ids, np.zeros((0, 1, 17, 3)))
+    for one in (nobody, never):
+        assert plot_stadium({}, "", one).startswith(b"\x89PNG")
+        few = Camera.stack([camera(3)[0]] * max(1, len(one.frames)))[: len(one.frames)]
+        assert largest_pose_changes(few, few, one) == (0, 0)
+    gone = np.full((1, 17, 3), np.nan)
+    for seen_by in (None, camera(1)[0]):
+        for found in (gone, np.ones((1, 17, 3))):
+            sample = Sample("a", 0, seen_by, gone, {"m": found})
+            assert plot_methods(sample).startswith(b"\x89PNG")
+
+
+def test_a_clip_has_the_true_paths_of_its_own_frames(monkeypatch):
+    """Frames 100 and 101 of the reference are those of the clip; nobody is reconstructed."""
+    drawn = []
+    nobody = JointTracks(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 0, 17, 3)))
+    stand_ins = {
+        "static_cameras": lambda *_: {},
+        "joint_tracks": lambda *_: nobody,
+        "shown_pitch": lambda *_: None,
+        "placed_joints": lambda *_: {"inliers": xr.DataArray(np.zeros((0, 0, 0, 0)), dims=DIMS)},
+        "plot_paths": lambda _, truth, **__: drawn.append(truth) or b"",
+    }
+    for name, stand_in in stand_ins.items():
+        monkeypatch.setattr(clips, name, stand_in)
+    spec = SimpleNamespace(clip=lambda _: SimpleNamespace(first_frame=100, frame_count=2))
+    match = SimpleNamespace(folder=SimpleNamespace(spec=spec))
+    joints = np.arange(4.0)[:, None, None, None] * np.ones((4, 1, 17, 3))
+    truth = JointTracks(np.array([99, 100, 101, 102]), np.array([7]), joints)
+    clips.clip_pictures(None, None, match, "b", truth)
+    clips.clip_pictures(None, None, match, "b")
+    assert (drawn[0].frames.tolist(), drawn[0].joints[:, 0, 0, 0].tolist()) == ([100, 101], [1, 2])
+    assert drawn[1] is None
+
+
+DIMS = ("frame", "camera", "person", "joint")
