@@ -205,7 +205,7 @@ def require_whole(request: RunRequest) -> None:
 
 def _require_usable(match: Match, request: RunRequest, overrides: Overrides) -> None:
     """Refuse a missing file that the stages of a request use, or one that it states itself."""
-    if request.body_folder is not None and not Path(request.body_folder).expanduser().is_dir():
+    if request.body_folder is not None and not Path(request.body_folder).is_dir():
         found, todo = f"no folder {request.body_folder}", "Install a body there, or name another."
         raise UsageError("--body-folder", "a folder with installed bodies", found, todo)
     part = selected_stages(request.from_stage, request.until_stage)

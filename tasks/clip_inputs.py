@@ -272,6 +272,7 @@ def _view_corrector(
             # A side at the image's border stays there: the border cuts off the person.
             stays = are_at_border(page, cameras.image_size[:, None]) & np.isfinite(moved)
             moved = np.where(stays, page, moved)
+            moved[..., 2:] = np.fmax(moved[..., 2:], moved[..., :2])  # of a person gone beyond it
         return moved.astype(page.dtype)
 
     return correct

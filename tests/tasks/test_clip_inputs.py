@@ -125,11 +125,12 @@ def test_clips_that_overlap_are_each_corrected_by_their_own_changes(monkeypatch)
         moved = (correct("keypoints", seen, slice(0, 6)) - seen)[:, 0, 0, 0, 0]
         np.testing.assert_allclose(moved, -40.0 * (frame >= 4), atol=0.1)
         # Boxes move as their joints do; a side at the image's border stays there.
-        box = np.array([[900.0, 500.0, 960.0, 600.0], [0.0, 500.0, 960.0, 600.0]], np.float32)
+        box = np.array([[900, 500, 960, 600], [0, 500, 960, 600], [0, 500, 30, 600]], np.float32)
         page = np.tile(box, (6, 1, 1, 1))
         moved = (correct("boxes", page, slice(0, 6)) - page)[frame >= 4, 0]
         np.testing.assert_allclose(moved[:, 0, [0, 2]], -40.0, atol=0.5)
         np.testing.assert_allclose(moved[:, 1, [0, 2]], [[0.0, -40.0]] * len(moved), atol=0.5)
+        np.testing.assert_array_equal(moved[:, 2, [0, 2]], [[0.0, -30.0]] * len(moved))
 
 
 @pytest.fixture
