@@ -156,8 +156,19 @@ class PitchTemplate:
         return np.array([self.crown, self.end_fall])
 
     def with_surface(self, surface: ArrayLike) -> PitchTemplate:
-        """Return the pitch with another crown and end fall (2,) [m]; surveyed heights stay."""
-        crown, end_fall = np.asarray(surface, dtype=np.float64).tolist()
+        """Return the pitch with another crown and end fall (2,) [m]; surveyed heights stay.
+
+        Raises:
+            InputError: these are not two finite numbers.
+        """
+        shape = np.asarray(surface, dtype=np.float64)
+        _require(
+            shape.shape == (2,) and bool(np.isfinite(shape).all()),
+            "PitchTemplate.with_surface",
+            "a finite crown and end fall [m]",
+            surface,
+        )
+        crown, end_fall = shape.tolist()
         change = (crown - self.crown, end_fall - self.end_fall)
         points = {}
         for name, place in self.points.items():
@@ -223,7 +234,7 @@ class PitchTemplate:
             spacing: largest distance between neighbours [m].
 
         Raises:
-            InputError: the name is unknown.
+            InputError: the name is unknown, or the spacing is not positive.
         """
         if name in self.lines or name in self.unpainted:
             return self._line_points({**self.lines, **self.unpainted}[name], spacing)
@@ -256,13 +267,6 @@ class PitchTemplate:
         Raises:
             InputError: the spacing is not positive.
         """
-        if not spacing > 0.0:
-            raise InputError(
-                "PitchTemplate.sample_lines: spacing",
-                expected="a positive distance [m]",
-                found=f"{spacing}",
-                todo="Give for example 0.25.",
-            )
         samples = [self._line_points(line, spacing) for line in self.lines.values()]
         samples += [self._arc_points(arc, spacing) for arc in self.arcs.values()]
         counts = [len(points) for points in samples]
@@ -317,6 +321,7 @@ def _shares(extent: float, spacing: float) -> Floats:
 
 
 def _steps(extent: float, spacing: float) -> int:
+    _require(spacing > 0.0, "spacing of samples", "a positive distance [m]", spacing)
     # Rounding errors of the extent must not add a step.
     return max(1, math.ceil(extent / spacing - 1e-9))
 
@@ -337,6 +342,11 @@ def _stripe_edges(spec: PitchSpec) -> dict[str, tuple[float, float]]:
         for n in range(count)
         for end, across in ENDS.items()
     }
+
+
+def _require(holds: bool, where: str, expected: str, found: object) -> None:
+    if not holds:
+        raise InputError(where, expected=expected, found=f"{found}", todo="Give such a value.")
 
 
 def _check_size(spec: PitchSpec, where: str) -> None:

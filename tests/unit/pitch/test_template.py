@@ -204,6 +204,20 @@ def test_another_surface_moves_all_but_surveyed_heights():
     assert moved.by_surface(["corner_left_far", "corner_left_near"]).tolist() == [[0, 0], [-1, -1]]
 
 
+@pytest.mark.parametrize("spacing", [0.0, -1.0, math.nan])
+@pytest.mark.parametrize("name", ["halfway_line", "center_circle", "crossbar_left"])
+def test_samples_need_a_positive_spacing(standard, name, spacing):
+    with pytest.raises(InputError, match="expected a positive distance"):
+        standard.marking_points(name, spacing)
+    assert len(standard.marking_points(name, math.inf)) >= 2  # the ends alone
+
+
+@pytest.mark.parametrize("surface", [[math.nan, 0.0], [0.1, math.inf], [0.1], 0.1])
+def test_a_surface_is_two_finite_numbers(standard, surface):
+    with pytest.raises(InputError, match="a finite crown and end fall"):
+        standard.with_surface(surface)
+
+
 def test_derivatives_of_samples_are_those_of_their_heights():
     pitch = PitchTemplate.from_spec(PitchSpec(points={"corner_right_near": (52.5, -34.0, -0.1)}))
     change = np.array([-0.05, 0.25])
