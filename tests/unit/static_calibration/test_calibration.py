@@ -130,6 +130,19 @@ def test_a_marking_under_another_ones_name_is_named_and_left_out():
     )
 
 
+def test_points_that_contradict_all_markings_are_tried_without_a_warning(recwarn):
+    camera, rng = people.seat(1)
+    names = ["touch_line_far", "halfway_line", "penalty_area_left_front"]
+    away = [
+        {"name": m.name, "xy": [(x, y + 60.0) for x, y in m.xy]}
+        for m in people.draw(camera, [n for n in names], rng)
+    ]
+    clicked = people.click(camera, rng, count=9).clicked
+    found = of(ClickedMarkings(points=clicked.points, drawn=away))
+    assert not any("empty slice" in str(each.message) for each in recwarn)
+    assert {each["name"] for each in away} <= set(found.report.wrong)
+
+
 def test_a_wrong_click_is_found_and_no_other():
     found = others = 0
     for index in range(12):
