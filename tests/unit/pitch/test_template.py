@@ -277,6 +277,16 @@ def test_markings_are_on_the_court_and_arcs_end_at_their_lines(template):
                 assert gaps.min() == pytest.approx(0.0, abs=1e-9)
 
 
+def test_the_second_penalty_mark_of_the_smallest_court_lies_in_its_centre_circle():
+    small = PitchTemplate.from_spec(PitchSpec(template="futsal", length=25.0, width=16.0))
+    assert small.points["second_penalty_mark_right"].tolist() == [2.5, 0.0, 0.0]  # circle: 3 m
+    # Twice the 10 m of the mark, and the areas' front edges at 6 m with the 3 m of the circle.
+    for marks, least in (({}, "20"), ({"second_penalty_mark_distance": 0.0}, "18")):
+        spec = PitchSpec(template="futsal", length=18.0, width=16.0, dimensions=marks)
+        with pytest.raises(InputError, match=f"more than {least} x"):
+            PitchTemplate.from_spec(spec)
+
+
 def test_dimensions_replace_those_of_the_template_and_zero_is_not_there():
     found = pitch("football", goal_width=5.0, goal_height=2.0, goal_area_depth=0.0)
     assert found.points["goal_post_left_far_top"] == pytest.approx([-52.5, 2.5, 2.0], abs=2e-3)
