@@ -6,13 +6,17 @@ import cv2
 import numpy as np
 import pytest
 import turning_clip as clip
+from pydantic import ValidationError
 
 from worldpose.broadcast_calibration.clip_problem import ClipProblem, TermWeights
 from worldpose.broadcast_calibration.evidence import FlowEvidence, PointEvidence
 from worldpose.broadcast_calibration.players import People, estimate_feed_offset
 from worldpose.broadcast_calibration.priors import build_prior
 from worldpose.broadcast_calibration.residuals import linearize
-from worldpose.broadcast_calibration.settings import BroadcastPrior
+from worldpose.broadcast_calibration.settings import (
+    BroadcastCalibrationSettings,
+    BroadcastPrior,
+)
 from worldpose.broadcast_calibration.solver import solve
 from worldpose.broadcast_calibration.tracking import (
     Followed,
@@ -32,6 +36,27 @@ def pairs_of(camera, rng):
         Followed(flow.start[flow.frame == t], flow.end[flow.frame == t], 1.0)
         for t in range(len(camera) - 1)
     ]
+
+
+@pytest.mark.parametrize(
+    ("center", "distance"),
+    [
+        ((0.0, -75.0, 17.0), 75.0),
+        ((0.0, 75.0, 17.0), 75.0),  # on the far side
+        ((-80.0, 0.0, 17.0), 80.0),  # behind a goal
+        ((30.0, 40.0, 17.0), 50.0),
+        ((0.0, 0.0, 17.0), 20.0),  # on a cable: its standard deviation
+    ],
+)
+def test_a_mean_center_on_any_side_is_a_prior_of_key_frames(center, distance):
+    prior = BroadcastCalibrationSettings(prior=BroadcastPrior(center_m=center)).key_frame.prior
+    assert (prior.distance_m, prior.height_m) == (distance, 17.0)
+
+
+@pytest.mark.parametrize("height", [0.0, -2.0])
+def test_a_mean_center_is_above_the_pitch(height):
+    with pytest.raises(ValidationError, match="center_m"):
+        BroadcastPrior(center_m=(0.0, -75.0, height))
 
 
 def test_a_turn_and_a_zoom_are_found_among_movers():
