@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 from data_contracts.arrays import Image
 from data_contracts.cameras import LensCalibration
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.geometry.cameras import Camera
+from worldpose.geometry.lens_models import LensModel
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.click_outliers import fit_inliers_at_best_noise
 from worldpose.static_calibration.evidence import check_amount, gather_evidence
@@ -28,6 +31,7 @@ def calibrate_camera(
     where: str = "clicked markings",
     lens: LensCalibration | None = None,
     start: Camera | None = None,
+    lens_models: Collection[LensModel] = tuple(LensModel),
 ) -> StaticCalibration:
     """Return the camera of an image, its covariance and its report.
 
@@ -46,6 +50,7 @@ def calibrate_camera(
         lens: a calibrated lens, the prior; k1, k2 and k3 are then solved for. None = not known.
         start: a camera near the answer, which replaces stage 1. Where the markings are their own
             image after half a turn, it decides the side.
+        lens_models: models of which an unknown lens may be, besides Brown's.
 
     Raises:
         InputError: a name is unknown, a pixel lies outside the image, names are mirrored, the
@@ -64,7 +69,7 @@ def calibrate_camera(
     near = find_start(problem, stated) if start is None else start.numbers
     if start is not None:
         near, _ = fit_from_starts(problem, near[None], stated.wrong_click)
-    found = choose_lens(fit_inliers_at_best_noise(problem, near, stated), stated)
+    found = choose_lens(fit_inliers_at_best_noise(problem, near, stated), stated, lens_models)
     found = find_explanation(found, pitch, stated)
     check_determined(found, pitch)
     found = try_k3(found)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 from typing import Final
 
@@ -30,8 +31,10 @@ _MIN_CLICKS: Final = 10
 parameters and the noise."""
 
 
-def choose_lens(found: Explanation, stated: StaticCalibrationSettings) -> Explanation:
-    """Return the explanation whose lens model is most probable, Brown's k1 and k2 or a fisheye.
+def choose_lens(
+    found: Explanation, stated: StaticCalibrationSettings, models: Collection[LensModel]
+) -> Explanation:
+    """Return the explanation whose lens model is most probable, Brown's k1 and k2 or another.
 
     All models have a posterior at their own noise of clicks, learned from the residuals, so that an
     error of the lens below the stated noise counts, too. Brown's model stands unless another one is
@@ -53,7 +56,7 @@ def choose_lens(found: Explanation, stated: StaticCalibrationSettings) -> Explan
     lowest = own - CLEAR_GAIN
     # Lens models, and their numbers of free radial coefficients, besides k1 and k2 of Brown's.
     candidates = ((LensModel.BROWN, 3), (LensModel.FISHEYE, 2), (LensModel.FISHEYE, 3))
-    for model, coefficients in candidates:
+    for model, coefficients in (each for each in candidates if each[0] in models):
         free = np.arange(STEP) < STEP - 3 + coefficients
         prior = as_stated.prior.copy()
         if model == LensModel.FISHEYE:
