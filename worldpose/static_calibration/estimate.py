@@ -53,7 +53,7 @@ def calibrate_camera(
         lens_models: models of which an unknown lens may be, besides Brown's.
 
     Raises:
-        InputError: a name is unknown, a pixel lies outside the image, names are mirrored, the
+        InputError: `method` is `paper`, a name is unknown, a pixel lies outside the image, names are mirrored, the
             clicks contradict each other, or they do not determine the camera; the message says
             which clicks to add.
 
@@ -61,6 +61,14 @@ def calibrate_camera(
         Paper section "Static Camera Calibration".
     """
     stated = settings or StaticCalibrationSettings()
+    if stated.method == "paper":
+        raise InputError(
+            f"{where}: method",
+            expected="worldpose, on whose inliers the paper's method follows",
+            found="paper",
+            todo="Give its result to `worldpose.reference_method.static_calibration.calibrate`, or "
+            "click the camera in a match folder.",
+        )
     own = {} if lens is None else {"distortion": "k1_k2_k3"}
     stated = stated.model_copy(update={"prior": stated.prior.beside(pitch.spec), **own})
     evidence = gather_evidence(pitch, clicked, image_size, stated.sample_spacing_m, where)

@@ -48,6 +48,11 @@ def test_clicks_that_no_image_has_are_refused(clicked, message):
         of(clicked)
 
 
+def test_the_method_of_the_paper_is_not_replaced_by_another():
+    with pytest.raises(InputError, match=r"found paper.*reference_method"):
+        of(people.points(people.visible(people.seat(0)[0])), method="paper")
+
+
 def test_three_points_are_too_few_and_the_message_names_others():
     camera, _ = people.seat(0)
     three = dict(list(people.visible(camera).items())[:3])
