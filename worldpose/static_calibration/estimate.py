@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
+import numpy as np
+
 from data_contracts.arrays import Image
 from data_contracts.cameras import LensCalibration
 from data_contracts.static_calibration import ClickedMarkings
@@ -11,7 +13,7 @@ from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_models import LensModel
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.click_outliers import fit_inliers_at_best_noise
-from worldpose.static_calibration.evidence import check_amount, gather_evidence
+from worldpose.static_calibration.evidence import ClickEvidence, check_amount, gather_evidence
 from worldpose.static_calibration.explanations import check_determined, find_explanation, try_k3
 from worldpose.static_calibration.fit import build_problem
 from worldpose.static_calibration.initialization import find_start, fit_from_starts
@@ -53,7 +55,7 @@ def calibrate_camera(
         lens_models: models of which an unknown lens may be, besides Brown's.
 
     Raises:
-        InputError: `method` is `paper`, a name is unknown, a pixel lies outside the image, names are mirrored, the
+        InputError: `method` is `paper`, `start` images no click, a name is unknown, a pixel lies outside the image, names are mirrored, the
             clicks contradict each other, or they do not determine the camera; the message says
             which clicks to add.
 
@@ -73,6 +75,8 @@ def calibrate_camera(
     stated = stated.model_copy(update={"prior": stated.prior.beside(pitch.spec), **own})
     evidence = gather_evidence(pitch, clicked, image_size, stated.sample_spacing_m, where)
     check_amount(evidence, pitch, where)
+    if start is not None:
+        _check_start(start, evidence, where)
     problem = build_problem(evidence, image_size, stated, where=where, lens=lens)
     near = find_start(problem, stated) if start is None else start.numbers
     if start is not None:
@@ -91,3 +95,16 @@ def calibrate_camera(
         estimate, pitch = lines.estimate.estimate, pitch.with_surface(lines.estimate.surface)
     report = build_report(estimate, found, lines, pitch, stated.click_noise_px)
     return StaticCalibration(estimate, report)
+
+
+def _check_start(start: Camera, evidence: ClickEvidence, where: str) -> None:
+    """Raise InputError unless a start is one camera that images something of the clicks."""
+    places = np.concatenate([evidence.points_world, evidence.samples_world])
+    found = f"cameras of shape {start.batch_shape}"
+    if start.batch_shape or not np.isfinite(start.project(places)).any():
+        raise InputError(
+            f"{where}: start",
+            expected="one camera near the answer",
+            found=found if start.batch_shape else "a camera that images no clicked marking",
+            todo="Give a single camera that looks at the markings, or none.",
+        )

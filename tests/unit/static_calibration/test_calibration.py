@@ -1,5 +1,7 @@
 """A camera is calibrated by clicks of known markings, and states its errors."""
 
+from dataclasses import replace
+
 import clicking_people as people
 import numpy as np
 import opencv_rig as rig
@@ -11,6 +13,8 @@ from scipy.stats import chi2
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.annotations import click, survey
 from worldpose.simulation.renderer import render_pitch
@@ -51,6 +55,16 @@ def test_clicks_that_no_image_has_are_refused(clicked, message):
 def test_the_method_of_the_paper_is_not_replaced_by_another():
     with pytest.raises(InputError, match=r"found paper.*reference_method"):
         of(people.points(people.visible(people.seat(0)[0])), method="paper")
+
+
+def test_a_start_is_one_camera_that_looks_at_the_markings():
+    camera, _ = people.seat(0)
+    clicked = people.points(people.visible(camera))
+    back = camera.cam_from_world.rotation * [[-1.0], [1.0], [-1.0]]  # half a turn about its y
+    away = replace(camera, cam_from_world=Rigid(back, -back @ camera.center))
+    for start, said in ((away, "images no clicked"), (Camera.stack([camera] * 2), r"\(2,\)")):
+        with pytest.raises(InputError, match=f"start: expected one camera.*{said}"):
+            calibrate_camera(PITCH, clicked, SIZE, start=start)
 
 
 def test_three_points_are_too_few_and_the_message_names_others():
