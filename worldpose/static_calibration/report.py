@@ -164,6 +164,13 @@ def build_report(
         drawn.append(MarkingResidual(name, len(off), rms, worst, bool(fit.markings[index])))
     ground_error = ground_error_map(estimate, pitch, settings.map_step_m)
     reasons = _accuracy_reasons(ground_error, fit, settings)
+    # Only a plane seen from straight above leaves more than a fifth to the prior.
+    if (open_focal := float(np.sqrt(estimate.covariance[6, 6]))) > 0.2:
+        reasons.append(
+            f"height {estimate.camera.center[2]:.1f} m and focal length "
+            f"{estimate.camera.focal[0]:.0f} px are open, give or take {open_focal:.0%}: click "
+            "points above the ground, or import a lens (worldpose import --lens)"
+        )
     misfit = describe_misfit(found)
     if reasons and not misfit and scale >= 3.0:
         misfit = (

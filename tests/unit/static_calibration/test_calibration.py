@@ -136,6 +136,33 @@ def test_exact_clicks_give_the_camera_back(index):
     assert people.ground_errors(result.estimate.camera, camera, places).max() < 5e-3
 
 
+@pytest.mark.parametrize("x", [0.0, 3.0])
+def test_a_camera_that_looks_straight_down_says_that_its_height_is_open(x):
+    hall, size = PitchTemplate.from_spec(PitchSpec(template="basketball")), people.SIZE
+    camera = people.pinhole((x, 0.01, 9.0), (x, 0.0, 0.0), 700.0, size)
+    rng, clicked = np.random.default_rng(5), {}
+    for name, place in hall.points.items():
+        pixel = camera.project(place[None])[0] + rng.standard_normal(2)
+        if place[2] == 0.0 and ((pixel > 5.0) & (pixel < np.array(size) - 6.0)).all():
+            clicked[name] = pixel
+    found = calibrate_camera(hall, people.points(clicked), size)
+    # The ground has 700 / 9 pixels a metre. In logarithms the priors are 4.8 +- 0.4 for the height
+    # and 3072 px +- 0.6 for the focal length: together 9.2 m give or take a third.
+    seen, known = found.estimate.camera, found.report
+    assert seen.focal[0] / seen.center[2] == pytest.approx(700.0 / 9.0, rel=0.01)
+    assert seen.center[2] == pytest.approx(9.2, rel=0.05)
+    assert np.sqrt(found.estimate.covariance[6, 6]) == pytest.approx(0.33, abs=0.05)
+    assert any("height" in each and "open" in each for each in known.contradictions)
+    # From the side, the same points tell both.
+    aside = people.pinhole((x, -14.0, 6.0), (x, 0.0, 0.0), 700.0, size)
+    names = [name for name, xy in zip(hall.points, aside.project(hall.positions(list(hall.points))))
+             if ((xy > 5.0) & (xy < np.array(size) - 6.0)).all()]  # fmt: skip
+    pixels = aside.project(hall.positions(names)) + rng.standard_normal((len(names), 2))
+    found = calibrate_camera(hall, people.points(dict(zip(names, pixels, strict=True))), size)
+    assert found.estimate.camera.center[2] == pytest.approx(6.0, rel=0.02)
+    assert not any("open" in each for each in found.report.reasons)
+
+
 def test_a_marking_under_another_ones_name_is_named_and_left_out():
     camera, rng = people.seat(1)
     drawn = list(people.draw(camera, list(PITCH.lines), rng, noise=0.5))
