@@ -118,7 +118,10 @@ def widen_by_lenses(
             continue
         step = np.zeros(STEP)
         rows = by_step[known][:, :, problem.free].reshape(-1, int(problem.free.sum()))
-        step[problem.free] = np.linalg.lstsq(rows, apart[known].ravel())[0]
+        # In standard deviations: a direction that moves no pixel of the pitch gets no step.
+        unit = np.linalg.cholesky(fit.covariance[np.ix_(problem.free, problem.free)])
+        found_step = np.linalg.lstsq(rows @ unit, apart[known].ravel(), rcond=1e-4)[0]
+        step[problem.free] = unit @ found_step
         size = float(np.sqrt(((by_step[known] @ step) ** 2).sum(axis=1).mean()))
         if size > largest:
             widest, largest = step, size
