@@ -6,16 +6,20 @@ from collections.abc import Collection
 
 import numpy as np
 
-from data_contracts.arrays import Image
+from data_contracts.arrays import Floats, Image
 from data_contracts.cameras import LensCalibration
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_models import LensModel
 from worldpose.pitch.template import PitchTemplate
-from worldpose.static_calibration.click_outliers import fit_inliers_at_best_noise
 from worldpose.static_calibration.evidence import ClickEvidence, check_amount, gather_evidence
-from worldpose.static_calibration.explanations import check_determined, find_explanation, try_k3
-from worldpose.static_calibration.fit import build_problem
+from worldpose.static_calibration.explanations import (
+    check_determined,
+    find_explanation,
+    fit_level_or_rolled,
+    try_k3,
+)
+from worldpose.static_calibration.fit import CameraProblem, build_problem
 from worldpose.static_calibration.initialization import find_start, fit_from_starts
 from worldpose.static_calibration.lens_choice import choose_lens, widen_by_lenses
 from worldpose.static_calibration.line_refinement import refine_and_judge
@@ -78,10 +82,13 @@ def calibrate_camera(
     if start is not None:
         _check_start(start, evidence, where)
     problem = build_problem(evidence, image_size, stated, where=where, lens=lens)
-    near = find_start(problem, stated) if start is None else start.numbers
-    if start is not None:
-        near, _ = fit_from_starts(problem, near[None], stated.wrong_click)
-    found = choose_lens(fit_inliers_at_best_noise(problem, near, stated), stated, lens_models)
+
+    def begin(problem: CameraProblem) -> Floats:
+        if start is None:
+            return find_start(problem, stated)
+        return fit_from_starts(problem, start.numbers[None], stated.wrong_click)[0]
+
+    found = choose_lens(fit_level_or_rolled(problem, begin, stated), stated, lens_models)
     found = find_explanation(found, pitch, stated)
     check_determined(found, pitch)
     found = try_k3(found)
