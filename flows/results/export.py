@@ -78,11 +78,11 @@ def export_worldpose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     """Write `poses/<clip>.npz` and `cameras/<broadcast view or static camera>.npz`.
 
     A clip without people has cameras alone. A moving camera of another frame rate than the match is
-    left out. Other lenses than Brown's are fitted by it; `lens_errors.json` states the largest
-    error, and `camera_changes/<clip>.json` how static cameras change within a clip.
+    left out. Other lenses than Brown's are fitted by it; `lens_errors.json` states the errors of
+    `fit_brown_lens`, and `camera_changes/<clip>.json` how static cameras change within a clip.
 
     Raises:
-        InputError: a clip has people and no bodies.
+        InputError: a clip has people and no bodies, or Brown's model does not follow a lens.
     """
     with_people = best_results.find_clips(origin.run.record)
     rates = (unit_frames(origin.spec, view).rate for view in broadcast_views(origin.run))
@@ -109,8 +109,8 @@ def export_worldpose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
         path = out / "cameras" / f"{name}.npz"
         if camera.lens_model != LensModel.BROWN:
             kind = LensModel(int(camera.lens_model)).label
-            camera, error = fit_brown_lens(camera)
-            errors[name] = {"lens_model": kind, "max_error_px": error}
+            camera, told = fit_brown_lens(camera, f"--format worldpose: {name}")
+            errors[name] = {"lens_model": kind, **told}
         write_static_camera(path, camera.to_calibration(name))
         yield path
     if errors:
