@@ -108,9 +108,9 @@ def export(
         told = json.loads(path.read_text()).values()
         off = max(each["max_error_px"] for each in told)
         sizes[path] = f": lenses in cameras/ differ from those used by up to {off:.2g} px"
-        if beyond := max(each["max_error_beyond_px"] for each in told):
+        if any(each["max_error_beyond_px"] != 0.0 for each in told):
             angle = min(each["fitted_angle_deg"] for each in told)
-            sizes[path] += f" within {angle:.0f} degrees of the axis, and {beyond:.2g} px beyond"
+            sizes[path] += f" within {angle:.0f} degrees of the axis, and more beyond"
     told = (f"wrote {path}{sizes.get(path, '')}" for path in written)
     answer({"match": name, "files": [str(path) for path in written]}, *told)
 

@@ -104,7 +104,7 @@ def export_worldpose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
         told = [each.model_dump() for each in view_changes(origin.run, clip)]
         path.write_text(json.dumps(told, indent=1), encoding="utf-8")
         yield path
-    errors: dict[str, dict[str, str | float]] = {}
+    errors: dict[str, dict[str, str | float | None]] = {}
     for name, camera in origin.static_cameras.items():
         path = out / "cameras" / f"{name}.npz"
         if camera.lens_model != LensModel.BROWN:

@@ -146,9 +146,7 @@ def track(
             todo="Click points in a frame that shows an area's corners or the centre circle.",
         )
     kept: dict[int, Image] = {}
-    followed = follow(
-        _keep_frames(clip, wanted, kept), clip.moving_boxes, settings.flow_points
-    )
+    followed = follow(_keep_frames(clip, wanted, kept), clip.moving_boxes, settings.flow_points)
     missing = sorted(wanted - set(kept))
     if missing:
         raise InputError(
@@ -376,9 +374,7 @@ def _select_flow(
     )
 
 
-def _keep_frames(
-    clip: BroadcastClip, wanted: set[int], kept: dict[int, Image]
-) -> Iterator[Image]:
+def _keep_frames(clip: BroadcastClip, wanted: set[int], kept: dict[int, Image]) -> Iterator[Image]:
     """Yield all frames, and store the wanted ones in `kept`.
 
     Raises:

@@ -30,7 +30,6 @@ from worldpose.broadcast_calibration.settings import BroadcastCalibrationSetting
 from worldpose.broadcast_calibration.solver import solve
 from worldpose.errors import DegenerateError, InputError
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.lens_models import LensModel
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.from_paint.proposal import propose_camera
@@ -269,12 +268,7 @@ def _calibrate_each(
         place = f"{where}: frame {key.frame}"
         try:
             found[frame] = calibrate_camera(
-                pitch,
-                key.markings,
-                image_size,
-                settings=settings.key_frame,
-                where=place,
-                lens_models=(LensModel.BROWN,),  # that of the clip
+                pitch, key.markings, image_size, settings=settings.key_frame, where=place
             )
         except (InputError, DegenerateError) as error:
             refused[frame] = f"{error}"

@@ -47,12 +47,12 @@ class MovingCamera:
         Raises:
             InputError: its lens is not of Brown's model.
         """
-        others = np.unique(camera.lens_model[camera.lens_model != LensModel.BROWN])
-        if len(others):
+        others = set(np.unique(camera.lens_model).tolist()) - {LensModel.BROWN.value}
+        if others:
             raise InputError(
                 "MovingCamera.of",
                 expected=f"lenses of the model {LensModel.BROWN.label}",
-                found=", ".join(LensModel(code).label for code in others.tolist()),
+                found=", ".join(LensModel(code).label for code in sorted(others)),
                 todo="Fit the frames with that model (`fit_brown_lens`).",
             )
         return cls(

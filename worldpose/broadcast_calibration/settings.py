@@ -51,10 +51,7 @@ class BroadcastPrior(Record):
     """Standard deviation of the logarithm of a focal length in camera data [1]."""
     given_center_std_m: float = Field(default=1.0, ge=1e-6, le=1000)
     """Standard deviation of a camera's place in camera data, each axis [m]."""
-    center_m: tuple[Coordinate, Coordinate, Annotated[Coordinate, Field(ge=0.1)]] = (
-        *(0.0, -75.0),
-        17.0,
-    )
+    center_m: tuple[Coordinate, Coordinate, Annotated[float, Field(ge=0.1, le=300)]] = (0, -75, 17)
     """Mean center in the world [m], above the pitch: on the main stand, at the halfway line."""
     center_std_m: tuple[Positive, Positive, Positive] = (15.0, 20.0, 8.0)
     """Standard deviation of the center [m]; 2022: 0.1, 6 and 2 m, of cameras at the halfway line in
@@ -159,5 +156,8 @@ class BroadcastCalibrationSettings(Record):
             log_distance_std=0.25,
         )
         return StaticCalibrationSettings(
-            prior=camera, click_noise_px=self.click_noise_px, survey_error_m=self.survey_error_m
+            prior=camera,
+            click_noise_px=self.click_noise_px,
+            survey_error_m=self.survey_error_m,
+            lens_model="brown",  # that of the clip
         )

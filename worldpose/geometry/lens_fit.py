@@ -117,7 +117,9 @@ def refit_lens(
     return fit_lens(lens, plane[known] / stretch, pixels[known], model, free)
 
 
-def fit_brown_lens(camera: Camera, where: str = "fit_brown_lens") -> tuple[Camera, dict[str, float]]:
+def fit_brown_lens(
+    camera: Camera, where: str = "fit_brown_lens"
+) -> tuple[Camera, dict[str, float | None]]:
     """Return a single camera with the nearest lens of Brown's model, and its errors.
 
     Focal length and principal point follow, too; the pose stays. Near 90 degrees from the axis no
@@ -126,7 +128,7 @@ def fit_brown_lens(camera: Camera, where: str = "fit_brown_lens") -> tuple[Camer
 
     Returns:
         The camera, and `max_error_px` within `fitted_angle_deg` of the axis, and
-        `max_error_beyond_px` over the rest of the image; NaN where Brown's lens has no image.
+        `max_error_beyond_px` over the rest of the image; None where Brown's lens folds there.
 
     Raises:
         InputError: errors are small in less than half of the image.
@@ -144,14 +146,15 @@ def fit_brown_lens(camera: Camera, where: str = "fit_brown_lens") -> tuple[Camer
     if not (fit.error_px <= most_px and near.mean() >= least_share):
         raise InputError(
             where,
-            expected=f"a lens that Brown's model follows within {most_px:g} px in half of the image",
+            expected=f"a lens that Brown's model follows to {most_px:g} px in half of the image",
             found=f"errors of {fit.error_px:.2g} px within {limit:.0f} degrees of the axis",
             todo="Export a format with the lens itself, or leave this camera out.",
         )
     off = fit.camera.project(np.insert(plane[far], 2, 1.0, axis=1)) - pixels[far]
+    beyond = float(np.linalg.norm(off, axis=1).max(initial=0.0))
     errors = {
         "max_error_px": fit.error_px,
         "fitted_angle_deg": float(limit),
-        "max_error_beyond_px": float(np.linalg.norm(off, axis=1).max(initial=0.0)),
+        "max_error_beyond_px": beyond if np.isfinite(beyond) else None,
     }
     return replace(fit.camera, cam_from_world=camera.cam_from_world), errors

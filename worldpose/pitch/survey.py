@@ -234,8 +234,8 @@ def _require_names(survey: Survey, offsets: Floats, settings: SurveySettings) ->
             survey.where,
             expected=f"every point within {settings.max_offset_m:g} m of the place of its name",
             found=f"farther off: {', '.join(far[:6])}",
-            todo="Exchange or correct these names, or remove the points from the file; `dimensions` "
-            "in pitch.json are for markings of other rules.",
+            todo="Exchange or correct these names, or remove the points from the file; markings of "
+            "other rules have `dimensions` in pitch.json.",
         )
 
 

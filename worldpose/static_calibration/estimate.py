@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-
 import numpy as np
 
 from data_contracts.arrays import Floats, Image
 from data_contracts.cameras import LensCalibration
 from data_contracts.static_calibration import ClickedMarkings
+from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.lens_models import LensModel
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.evidence import ClickEvidence, check_amount, gather_evidence
 from worldpose.static_calibration.explanations import (
@@ -37,7 +35,6 @@ def calibrate_camera(
     where: str = "clicked markings",
     lens: LensCalibration | None = None,
     start: Camera | None = None,
-    lens_models: Collection[LensModel] = tuple(LensModel),
 ) -> StaticCalibration:
     """Return the camera of an image, its covariance and its report.
 
@@ -56,12 +53,12 @@ def calibrate_camera(
         lens: a calibrated lens, the prior; k1, k2 and k3 are then solved for. None = not known.
         start: a camera near the answer, which replaces stage 1. Where the markings are their own
             image after half a turn, it decides the side.
-        lens_models: models of which an unknown lens may be, besides Brown's.
 
     Raises:
-        InputError: `method` is `paper`, `start` images no click, a name is unknown, a pixel lies outside the image, names are mirrored, the
-            clicks contradict each other, or they do not determine the camera; the message says
-            which clicks to add.
+        InputError: `method` is `paper`, `start` images no click, the lens is of another image size,
+            a name is unknown, a pixel lies outside the image, names are mirrored, the clicks
+            contradict each other, or they do not determine the camera; the message says which
+            clicks to add.
 
     Note:
         Paper section "Static Camera Calibration".
@@ -88,7 +85,7 @@ def calibrate_camera(
             return find_start(problem, stated)
         return fit_from_starts(problem, start.numbers[None], stated.wrong_click)[0]
 
-    found = choose_lens(fit_level_or_rolled(problem, begin, stated), stated, lens_models)
+    found = choose_lens(fit_level_or_rolled(problem, begin, stated), stated)
     found = find_explanation(found, pitch, stated)
     check_determined(found, pitch)
     found = try_k3(found)

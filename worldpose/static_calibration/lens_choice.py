@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import replace
 from typing import Final
 
@@ -31,10 +30,8 @@ _MIN_CLICKS: Final = 10
 parameters and the noise."""
 
 
-def choose_lens(
-    found: Explanation, stated: StaticCalibrationSettings, models: Collection[LensModel]
-) -> Explanation:
-    """Return the explanation whose lens model is most probable, Brown's k1 and k2 or another.
+def choose_lens(found: Explanation, stated: StaticCalibrationSettings) -> Explanation:
+    """Return the explanation whose lens model is most probable, Brown's k1 and k2 or a fisheye.
 
     All models have a posterior at their own noise of clicks, learned from the residuals, so that an
     error of the lens below the stated noise counts, too. Brown's model stands unless another one is
@@ -56,7 +53,7 @@ def choose_lens(
     lowest = own - CLEAR_GAIN
     # Lens models, and their numbers of free radial coefficients, besides k1 and k2 of Brown's.
     candidates = ((LensModel.BROWN, 3), (LensModel.FISHEYE, 2), (LensModel.FISHEYE, 3))
-    for model, coefficients in (each for each in candidates if each[0] in models):
+    for model, coefficients in candidates[: 1 if stated.lens_model == "brown" else None]:
         free = np.arange(STEP) < STEP - 3 + coefficients
         prior = as_stated.prior.copy()
         if model == LensModel.FISHEYE:

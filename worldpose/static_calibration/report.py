@@ -182,8 +182,8 @@ def build_report(
     # The heights of the image's axes, right and down, tell the roll unless it looks straight down.
     right, down = estimate.camera.cam_from_world.rotation[:2, 2]
     if max(abs(right), down) > 0.1:
-        roll = np.degrees(np.arctan2(-right, -down))  # clockwise, as seen from behind
-        decisions.append(f"the camera is rolled about its axis by {roll:+.0f} degrees")
+        roll = np.degrees(np.arctan2(-right, -down))
+        decisions.append(f"the camera is rolled by {roll:+.0f} degrees, clockwise from behind")
     if abs(scale - 1.0) > 0.01:
         decisions.append(
             f"the errors of clicks and drawn pixels are {scale:.2g} times the stated noise; the "

@@ -149,6 +149,8 @@ class StaticCalibrationSettings(Record):
     reliable majority."""
     distortion: Literal["none", "k1", "k1_k2", "k1_k2_k3"] = "k1_k2"
     """Free radial coefficients."""
+    lens_model: Literal["any", "brown"] = "any"
+    """Models of an unknown lens: Brown's and fisheyes, or Brown's alone."""
     k3_gain: float = Field(default=0.1, ge=1e-6, le=10)
     """Minimum relative reduction of the held-out error to keep k3 [1]."""
     search_cameras: int = Field(default=24, ge=1, le=10000)

@@ -77,7 +77,7 @@ def test_key_frames_of_a_wide_lens_keep_the_model_of_the_clip():
     seen = true.project(clip.PITCH.positions(list(clip.PITCH.points)))
     seen += np.random.default_rng(1).normal(0.0, 0.7, seen.shape)
     inside = ((seen > 5.0) & (seen < np.array(size) - 6.0)).all(axis=1)
-    pixels = {name: xy for name, xy, kept in zip(clip.PITCH.points, seen, inside) if kept}
+    pixels = {name: seen[n] for n, name in enumerate(clip.PITCH.points) if inside[n]}
     clicked = ClickedMarkings.model_validate(
         {"points": [{"name": name, "xy": tuple(xy)} for name, xy in pixels.items()]}
     )

@@ -7,6 +7,7 @@ from camera_builders import plain_camera
 from run_records import calibration
 
 from data_contracts.cameras import COEFFICIENTS
+from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_fit import fit_brown_lens
 from worldpose.geometry.lens_models import (
@@ -233,7 +234,8 @@ def test_the_corners_of_a_very_wide_fisheye_do_not_spoil_the_middle_of_browns_le
     stated |= {"image_size": (640, 480), "lens_model": "fisheye"}
     camera = Camera.from_calibration(calibration("a", distortion=(0.0,) * 4, **stated))
     near, told = fit_brown_lens(camera)
-    assert told["max_error_px"] <= 2.0 < told["max_error_beyond_px"]
+    assert told["max_error_px"] <= 2.0
+    assert told["max_error_beyond_px"] is None  # the polynomial folds before the corners
     limit = told["fitted_angle_deg"]
     assert 45.0 < limit < 76.5
     # Pixels on a circle about the middle are `radius / 300` rad off the axis.

@@ -155,12 +155,38 @@ def test_a_camera_that_looks_straight_down_says_that_its_height_is_open(x):
     assert any("height" in each and "open" in each for each in known.contradictions)
     # From the side, the same points tell both.
     aside = people.pinhole((x, -14.0, 6.0), (x, 0.0, 0.0), 700.0, size)
-    names = [name for name, xy in zip(hall.points, aside.project(hall.positions(list(hall.points))))
-             if ((xy > 5.0) & (xy < np.array(size) - 6.0)).all()]  # fmt: skip
-    pixels = aside.project(hall.positions(names)) + rng.standard_normal((len(names), 2))
-    found = calibrate_camera(hall, people.points(dict(zip(names, pixels, strict=True))), size)
+    clicked = {}
+    for name, place in hall.points.items():
+        pixel = aside.project(place[None])[0] + rng.standard_normal(2)
+        if ((pixel > 5.0) & (pixel < np.array(size) - 6.0)).all():
+            clicked[name] = pixel
+    found = calibrate_camera(hall, people.points(clicked), size)
     assert found.estimate.camera.center[2] == pytest.approx(6.0, rel=0.02)
     assert not any("open" in each for each in found.report.reasons)
+
+
+@pytest.mark.parametrize(
+    ("roll", "size"), [(90.0, people.SIZE), (-90.0, (1080, 1920)), (35.0, SIZE)]
+)
+def test_a_rolled_camera_keeps_its_right_clicks_and_says_its_roll(roll, size):
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        place, aim = (rng.uniform(-30.0, 30.0), -80.0, 18.0), (rng.uniform(-30.0, 30.0), 0.0, 0.0)
+        camera = people.pinhole(place, aim, 1600.0, size, roll=np.radians(roll))
+        pixels = camera.project(PITCH.positions(list(PITCH.points)))
+        inside = ((pixels > 5.0) & (pixels < np.array(size) - 6.0)).all(axis=1)
+        chosen = rng.permutation(np.flatnonzero(inside))[:8]
+        pixels = pixels + 0.7 * rng.standard_normal(pixels.shape)
+        clicked = people.points({list(PITCH.points)[n]: pixels[n] for n in chosen})
+        found = calibrate_camera(PITCH, clicked, size)
+        assert found.report.wrong == ()
+        right, down = camera.cam_from_world.rotation[:2, 2]
+        said = f"rolled by {np.degrees(np.arctan2(-right, -down)):+.0f} degrees"
+        assert any(said in each for each in found.report.decisions)
+        assert np.abs(found.estimate.camera.center - camera.center).max() < 8.0
+    # Seats of the stadium are level.
+    level = of(people.click(*people.seat(0)).clicked)
+    assert not any("rolled" in each for each in level.report.decisions)
 
 
 def test_a_marking_under_another_ones_name_is_named_and_left_out():
@@ -181,7 +207,7 @@ def test_points_that_contradict_all_markings_are_tried_without_a_warning(recwarn
     names = ["touch_line_far", "halfway_line", "penalty_area_left_front"]
     away = [
         {"name": m.name, "xy": [(x, y + 60.0) for x, y in m.xy]}
-        for m in people.draw(camera, [n for n in names], rng)
+        for m in people.draw(camera, names, rng)
     ]
     clicked = people.click(camera, rng, count=9).clicked
     found = of(ClickedMarkings(points=clicked.points, drawn=away))
