@@ -98,7 +98,7 @@ def _calibrate(inputs: UnitInputs) -> StaticCalibration:
             clicked_markings(clicked),
             (width, height),
             picture=None if by_paper else picture,
-            settings=settings,
+            settings=settings.model_copy(update={"method": "worldpose"}),
             where=file,
             lens=lens,
         )

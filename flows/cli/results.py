@@ -105,8 +105,12 @@ def export(
         path: f", {path.stat().st_size / 1e6:.1f} MB" for path in written if path.suffix == ".html"
     }
     for path in (path for path in written if path.name == LENS_ERRORS):
-        off = max(each["max_error_px"] for each in json.loads(path.read_text()).values())
+        told = json.loads(path.read_text()).values()
+        off = max(each["max_error_px"] for each in told)
         sizes[path] = f": lenses in cameras/ differ from those used by up to {off:.2g} px"
+        if any(each["max_error_beyond_px"] != 0.0 for each in told):
+            angle = min(each["fitted_angle_deg"] for each in told)
+            sizes[path] += f" within {angle:.0f} degrees of the axis, and more beyond"
     told = (f"wrote {path}{sizes.get(path, '')}" for path in written)
     answer({"match": name, "files": [str(path) for path in written]}, *told)
 

@@ -78,11 +78,11 @@ def export_worldpose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     """Write `poses/<clip>.npz` and `cameras/<broadcast view or static camera>.npz`.
 
     A clip without people has cameras alone. A moving camera of another frame rate than the match is
-    left out. Other lenses than Brown's are fitted by it; `lens_errors.json` states the largest
-    error, and `camera_changes/<clip>.json` how static cameras change within a clip.
+    left out. Other lenses than Brown's are fitted by it; `lens_errors.json` states the errors of
+    `fit_brown_lens`, and `camera_changes/<clip>.json` how static cameras change within a clip.
 
     Raises:
-        InputError: a clip has people and no bodies.
+        InputError: a clip has people and no bodies, or Brown's model does not follow a lens.
     """
     with_people = best_results.find_clips(origin.run.record)
     rates = (unit_frames(origin.spec, view).rate for view in broadcast_views(origin.run))
@@ -104,13 +104,13 @@ def export_worldpose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
         told = [each.model_dump() for each in view_changes(origin.run, clip)]
         path.write_text(json.dumps(told, indent=1), encoding="utf-8")
         yield path
-    errors: dict[str, dict[str, str | float]] = {}
+    errors: dict[str, dict[str, str | float | None]] = {}
     for name, camera in origin.static_cameras.items():
         path = out / "cameras" / f"{name}.npz"
         if camera.lens_model != LensModel.BROWN:
             kind = LensModel(int(camera.lens_model)).label
-            camera, error = fit_brown_lens(camera)
-            errors[name] = {"lens_model": kind, "max_error_px": error}
+            camera, told = fit_brown_lens(camera, f"--format worldpose: {name}")
+            errors[name] = {"lens_model": kind, **told}
         write_static_camera(path, camera.to_calibration(name))
         yield path
     if errors:

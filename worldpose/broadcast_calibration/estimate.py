@@ -146,9 +146,7 @@ def track(
             todo="Click points in a frame that shows an area's corners or the centre circle.",
         )
     kept: dict[int, Image] = {}
-    followed = follow(
-        _keep_frames(clip.pictures(), wanted, kept), clip.moving_boxes, settings.flow_points
-    )
+    followed = follow(_keep_frames(clip, wanted, kept), clip.moving_boxes, settings.flow_points)
     missing = sorted(wanted - set(kept))
     if missing:
         raise InputError(
@@ -376,14 +374,29 @@ def _select_flow(
     )
 
 
-def _keep_frames(
-    pictures: Iterator[Image], wanted: set[int], kept: dict[int, Image]
-) -> Iterator[Image]:
-    """Yield all frames, and store the wanted ones in `kept`."""
-    for number, picture in enumerate(pictures):
-        if number in wanted:
-            kept[number] = picture
+def _keep_frames(clip: BroadcastClip, wanted: set[int], kept: dict[int, Image]) -> Iterator[Image]:
+    """Yield all frames, and store the wanted ones in `kept`.
+
+    Raises:
+        InputError: people, boxes or camera data have other frames than the pictures.
+    """
+    data = (clip.boxes, clip.people and clip.people.joints, clip.given and clip.given.values)
+    given = {len(rows) for rows in data if rows is not None}
+    count, pictures = 0, clip.pictures()
+    for count, picture in enumerate(pictures, 1):
+        if given and count > min(given):
+            count += sum(1 for _ in pictures)
+            break
+        if count - 1 in wanted:
+            kept[count - 1] = picture
         yield picture
+    if given - {count}:
+        raise InputError(
+            clip.where,
+            expected="people, boxes and camera data of every picture of the clip",
+            found=f"{count} pictures, and data of {', '.join(map(str, sorted(given)))}",
+            todo="Give rows for all pictures, NaN where nothing is known.",
+        )
 
 
 def _finite_or_zero(value: float) -> float:

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from data_contracts.arrays import Floats, Integers
+from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
+from worldpose.geometry.lens_models import LensModel
 from worldpose.geometry.rigid import Rigid
 from worldpose.static_calibration.parameters import by_step
 
@@ -40,7 +42,19 @@ class MovingCamera:
 
     @classmethod
     def of(cls, camera: Camera, center: ArrayLike, principal_point: ArrayLike) -> MovingCamera:
-        """Return a batch (frames,) with another center [m] and principal point [px]."""
+        """Return a batch (frames,) with another center [m] and principal point [px].
+
+        Raises:
+            InputError: its lens is not of Brown's model.
+        """
+        others = set(np.unique(camera.lens_model).tolist()) - {LensModel.BROWN.value}
+        if others:
+            raise InputError(
+                "MovingCamera.of",
+                expected=f"lenses of the model {LensModel.BROWN.label}",
+                found=", ".join(LensModel(code).label for code in sorted(others)),
+                todo="Fit the frames with that model (`fit_brown_lens`).",
+            )
         return cls(
             center=np.asarray(center, dtype=np.float64),
             principal_point=np.asarray(principal_point, dtype=np.float64),

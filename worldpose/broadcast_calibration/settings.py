@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -50,8 +51,8 @@ class BroadcastPrior(Record):
     """Standard deviation of the logarithm of a focal length in camera data [1]."""
     given_center_std_m: float = Field(default=1.0, ge=1e-6, le=1000)
     """Standard deviation of a camera's place in camera data, each axis [m]."""
-    center_m: tuple[Coordinate, Coordinate, Coordinate] = (0.0, -75.0, 17.0)
-    """Mean center in the world [m]: on the main stand, at the halfway line."""
+    center_m: tuple[Coordinate, Coordinate, Annotated[float, Field(ge=0.1, le=300)]] = (0, -75, 17)
+    """Mean center in the world [m], above the pitch: on the main stand, at the halfway line."""
     center_std_m: tuple[Positive, Positive, Positive] = (15.0, 20.0, 8.0)
     """Standard deviation of the center [m]; 2022: 0.1, 6 and 2 m, of cameras at the halfway line in
     large stadiums."""
@@ -150,9 +151,13 @@ class BroadcastCalibrationSettings(Record):
             k2_std=2.0 * prior.k2 * corner**2,
             height_m=prior.center_m[2],
             log_height_std=0.35,
-            distance_m=-prior.center_m[1],
+            # Nearer to the centre spot than its own deviation, a mean tells no distance.
+            distance_m=max(math.hypot(*prior.center_m[:2]), *prior.center_std_m[:2]),
             log_distance_std=0.25,
         )
         return StaticCalibrationSettings(
-            prior=camera, click_noise_px=self.click_noise_px, survey_error_m=self.survey_error_m
+            prior=camera,
+            click_noise_px=self.click_noise_px,
+            survey_error_m=self.survey_error_m,
+            lens_model="brown",  # that of the clip
         )

@@ -228,14 +228,26 @@ class Camera:
 
     @classmethod
     def from_lens(cls, lens: LensCalibration, image_size: ArrayLike | None = None) -> Camera:
-        """Return a camera with a lens, at the origin; the image size is the lens's if None."""
+        """Return a camera with a lens, at the origin, for images of its size.
+
+        Raises:
+            InputError: the images have another size (width, height) [px].
+        """
+        if image_size is not None and tuple(np.asarray(image_size)) != lens.image_size:
+            width, height = np.asarray(image_size)
+            raise InputError(
+                f"lens {lens.id}",
+                expected=f"image_size {width} x {height}, that of the image",
+                found=f"{lens.image_size[0]} x {lens.image_size[1]}",
+                todo="Calibrate the lens in images of this size, or scale its numbers of pixels.",
+            )
         model = LensModel.named(lens.lens_model)
         return cls(
             focal=np.array([lens.focal_px, lens.focal_px]),
             principal_point=np.array(lens.principal_point_px),
             distortion=_spread_coefficients(f"lens {lens.id}", lens.distortion, model),
             cam_from_world=Rigid.identity(),
-            image_size=np.array(lens.image_size if image_size is None else image_size),
+            image_size=np.array(lens.image_size),
             lens_model=model,
         )
 

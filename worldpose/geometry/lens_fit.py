@@ -17,6 +17,7 @@ import numpy as np
 from data_contracts.arrays import Floats
 from data_contracts.cameras import COEFFICIENTS
 from data_contracts.conventions import DISTORTION
+from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_models import LensModel
 from worldpose.geometry.optimize.levenberg_marquardt import Damping, minimize
@@ -116,11 +117,44 @@ def refit_lens(
     return fit_lens(lens, plane[known] / stretch, pixels[known], model, free)
 
 
-def fit_brown_lens(camera: Camera) -> tuple[Camera, float]:
-    """Return a single camera with the nearest lens of Brown's model, and the largest error [px].
+def fit_brown_lens(
+    camera: Camera, where: str = "fit_brown_lens"
+) -> tuple[Camera, dict[str, float | None]]:
+    """Return a single camera with the nearest lens of Brown's model, and its errors.
 
-    Focal length and principal point follow, too; the pose stays.
+    Focal length and principal point follow, too; the pose stays. Near 90 degrees from the axis no
+    polynomial follows a fisheye, and places there would spoil the middle: the fit is to the widest
+    cone about the axis in which its errors are small.
+
+    Returns:
+        The camera, and `max_error_px` within `fitted_angle_deg` of the axis, and
+        `max_error_beyond_px` over the rest of the image; None where Brown's lens folds there.
+
+    Raises:
+        InputError: errors are small in less than half of the image.
     """
+    most_px, least_share = 2.0, 0.5
     free = (*INTRINSICS, *COEFFICIENTS["brown"])
-    fit = refit_lens(camera, LensModel.BROWN, free)
-    return replace(fit.camera, cam_from_world=camera.cam_from_world), fit.error_px
+    pixels = camera.image_grid()
+    plane = camera.normalize(pixels)
+    angle = np.degrees(np.arctan(np.hypot(*plane.T)))
+    for limit in np.nanmax(angle) * np.linspace(1.0, 0.5, 11):
+        near, far = angle <= limit, angle > limit
+        fit = fit_lens(camera, plane[near], pixels[near], LensModel.BROWN, free)
+        if fit.error_px <= most_px or near.mean() < least_share:
+            break
+    if not (fit.error_px <= most_px and near.mean() >= least_share):
+        raise InputError(
+            where,
+            expected=f"a lens that Brown's model follows to {most_px:g} px in half of the image",
+            found=f"errors of {fit.error_px:.2g} px within {limit:.0f} degrees of the axis",
+            todo="Export a format with the lens itself, or leave this camera out.",
+        )
+    off = fit.camera.project(np.insert(plane[far], 2, 1.0, axis=1)) - pixels[far]
+    beyond = float(np.linalg.norm(off, axis=1).max(initial=0.0))
+    errors = {
+        "max_error_px": fit.error_px,
+        "fitted_angle_deg": float(limit),
+        "max_error_beyond_px": beyond if np.isfinite(beyond) else None,
+    }
+    return replace(fit.camera, cam_from_world=camera.cam_from_world), errors

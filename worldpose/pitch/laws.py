@@ -173,11 +173,15 @@ def least_size(spec: PitchSpec) -> tuple[float, float]:
     """Return the length and the width [m] below which the prescribed markings do not fit."""
     inner, other = (prescribed_markings(spec, size) for size in ((0.0, 0.0), (1.0, 1.0)))
     length, reach, width = [0.0], [0.0], [0.0]
+    drawn = {arc.center for arc in inner.arcs.values()}
+    drawn.update(*((line.start, line.end) for line in inner.lines.values()))
     for name, (x, y, _) in inner.points.items():
         if other.points[name][0] == x:
             length.append(2.0 * abs(x))
-        else:
+        elif name in drawn:
             reach.append(-SIDES[_side(name)] * x)
+        else:  # a mark alone may lie inside the centre circle
+            length.append(-2.0 * SIDES[_side(name)] * x)
         width.append(2.0 * abs(y) if other.points[name][1] == y else 0.0)
     for arc in inner.arcs.values():
         x = inner.points[arc.center][0]

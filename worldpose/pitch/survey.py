@@ -234,7 +234,8 @@ def _require_names(survey: Survey, offsets: Floats, settings: SurveySettings) ->
             survey.where,
             expected=f"every point within {settings.max_offset_m:g} m of the place of its name",
             found=f"farther off: {', '.join(far[:6])}",
-            todo="Exchange or correct these names, or remove the points from the file.",
+            todo="Exchange or correct these names, or remove the points from the file; markings of "
+            "other rules have `dimensions` in pitch.json.",
         )
 
 
@@ -361,8 +362,9 @@ def _fit_plan(
     """Fit rotation, shift, length and width by robust least squares, with `stretch` the scale."""
     middle = places.mean(axis=0)
     centred = places - middle
-    usual = _usual_size(survey)
-    size = np.array(usual)
+    usual, gross = _usual_size(survey), _gross_scale(survey, places)
+    # The fit converges over a third; a smaller pitch starts at the size that it seems to have.
+    size = np.array(usual) * (gross if gross <= 0.7 else 1.0)
     law = _nominal_places(survey)
     turn, shift = _best_rotation(centred, law), law.mean(axis=0)
     spreads = np.array([settings.length_std_m, settings.width_std_m])
@@ -448,13 +450,17 @@ def _leveling_rotation(slope: Floats) -> Floats:
     )
 
 
-def _estimate_scale(survey: Survey, places: Floats, settings: SurveySettings) -> float:
-    """Return the ratio of lengths in the survey to true ones; reject that of another unit."""
+def _gross_scale(survey: Survey, places: Floats) -> float:
+    """Return the extent of surveyed points over that on a pitch of the usual size [1]."""
     nominal = _nominal_places(survey)
     extents = [np.linalg.norm(each - each.mean(axis=0)) for each in (places, nominal)]
-    gross = float(extents[0] / extents[1])
-    scale = gross
-    if abs(gross - 1.0) < 0.3:  # within the fit's convergence range: prescribed markings decide
+    return float(extents[0] / extents[1])
+
+
+def _estimate_scale(survey: Survey, places: Floats, settings: SurveySettings) -> float:
+    """Return the ratio of lengths in the survey to true ones; reject that of another unit."""
+    gross = scale = _gross_scale(survey, places)
+    if 0.3 < gross < 1.3:  # no unit is as near, and the fit converges: prescribed markings decide
         turn = _fit_plan(survey, places, settings, stretch=True).turn
         scale = 1.0 / float(np.sqrt(np.linalg.det(turn)))
     if abs(scale - 1.0) <= settings.max_scale_error:
@@ -464,6 +470,9 @@ def _estimate_scale(survey: Survey, places: Floats, settings: SurveySettings) ->
     raise InputError(
         survey.where,
         expected="metres",
-        found=f"lengths {scale:.4g} times too large" + (f", as {near[0]} are" if near else ""),
-        todo="Convert the file to metres; where only corners are surveyed, add penalty areas.",
+        found=f"lengths {scale:.4g} {'of' if scale < 1.0 else 'times'} the true length"
+        + (f", as {near[0]} are" if near else ""),
+        todo="Convert the file to metres. Corners alone do not tell another size than about "
+        f"{survey.usual.length:g} x {survey.usual.width:g} m: add markings of prescribed size, "
+        "such as penalty areas.",
     )

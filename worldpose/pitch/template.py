@@ -156,8 +156,15 @@ class PitchTemplate:
         return np.array([self.crown, self.end_fall])
 
     def with_surface(self, surface: ArrayLike) -> PitchTemplate:
-        """Return the pitch with another crown and end fall (2,) [m]; surveyed heights stay."""
-        crown, end_fall = np.asarray(surface, dtype=np.float64).tolist()
+        """Return the pitch with another crown and end fall (2,) [m]; surveyed heights stay.
+
+        Raises:
+            InputError: these are not two finite numbers.
+        """
+        given = np.asarray(surface, dtype=np.float64)
+        is_known = given.shape == (2,) and bool(np.isfinite(given).all())
+        _require(is_known, "with_surface", "a finite crown and end fall [m]", surface)
+        crown, end_fall = given.tolist()
         change = (crown - self.crown, end_fall - self.end_fall)
         points = {}
         for name, place in self.points.items():
@@ -223,7 +230,7 @@ class PitchTemplate:
             spacing: largest distance between neighbours [m].
 
         Raises:
-            InputError: the name is unknown.
+            InputError: the name is unknown, or the spacing is not positive.
         """
         if name in self.lines or name in self.unpainted:
             return self._line_points({**self.lines, **self.unpainted}[name], spacing)
@@ -256,13 +263,6 @@ class PitchTemplate:
         Raises:
             InputError: the spacing is not positive.
         """
-        if not spacing > 0.0:
-            raise InputError(
-                "PitchTemplate.sample_lines: spacing",
-                expected="a positive distance [m]",
-                found=f"{spacing}",
-                todo="Give for example 0.25.",
-            )
         samples = [self._line_points(line, spacing) for line in self.lines.values()]
         samples += [self._arc_points(arc, spacing) for arc in self.arcs.values()]
         counts = [len(points) for points in samples]
@@ -317,6 +317,7 @@ def _shares(extent: float, spacing: float) -> Floats:
 
 
 def _steps(extent: float, spacing: float) -> int:
+    _require(spacing > 0.0, "spacing of samples", "a positive distance [m]", spacing)
     # Rounding errors of the extent must not add a step.
     return max(1, math.ceil(extent / spacing - 1e-9))
 
@@ -339,34 +340,39 @@ def _stripe_edges(spec: PitchSpec) -> dict[str, tuple[float, float]]:
     }
 
 
+def _require(
+    holds: bool, where: str, expected: str, found: object, todo: str = "Give such a value."
+) -> None:
+    if not holds:
+        raise InputError(where, expected=expected, found=f"{found}", todo=todo)
+
+
 def _check_size(spec: PitchSpec, where: str) -> None:
     """Raise InputError unless the prescribed markings fit into the pitch, and into each other."""
     length, width = least_size(spec)
-    if spec.length <= length or spec.width <= width:
-        raise InputError(
-            f"{where}: length and width",
-            expected=f"more than {length:g} x {width:g} m, room for the markings",
-            found=f"{spec.length:g} x {spec.width:g}",
-            todo="Give metres between the centres of the outer lines.",
-        )
+    _require(
+        spec.length > length and spec.width > width,
+        f"{where}: length and width",
+        f"more than {length:g} x {width:g} m, room for the markings",
+        f"{spec.length:g} x {spec.width:g}",
+        "Give metres between the centres of the outer lines.",
+    )
     todo = "Correct the dimensions, in metres; 0 is for what is not painted."
     for names in _RISING:
         given = {name: spec.sizes[name] for name in names if spec.sizes.get(name)}
-        if [*given.values()] != sorted(given.values()):
-            raise InputError(
-                f"{where}: dimensions",
-                expected=f"{', '.join(given)} in rising order",
-                found=", ".join(f"{size:g}" for size in given.values()),
-                todo=todo,
-            )
+        _require(
+            [*given.values()] == sorted(given.values()),
+            f"{where}: dimensions",
+            f"{', '.join(given)} in rising order",
+            ", ".join(f"{size:g}" for size in given.values()),
+            todo,
+        )
     for name, most in _largest(spec).items():
-        if spec.sizes.get(name, 0.0) > most:
-            raise InputError(
-                f"{where}: dimensions.{name}",
-                expected=f"at most {most:g} m, where other markings begin",
-                found=f"{spec.sizes[name]:g}",
-                todo=todo,
-            )
+        size, expected = (
+            spec.sizes.get(name, 0.0),
+            f"at most {most:g} m, where other markings begin",
+        )
+        _require(size <= most, f"{where}: dimensions.{name}", expected, f"{size:g}", todo)
 
 
 _RISING: Final = (

@@ -314,8 +314,12 @@ def _select_markings(
     evidence = problem.evidence
     away = np.abs(compute_residuals(problem, row).drawn)
     marking = evidence.drawn_marking
+    # A marking that `select` left without pixels is not near anything.
     medians = np.array(
-        [np.median(away[marking == index]) for index in range(len(evidence.markings))]
+        [
+            np.median(away[marking == index]) if index in marking else np.inf
+            for index in range(len(evidence.markings))
+        ]
     )
     accepted = np.asarray(medians < settings.wrong_marking * settings.drawn_noise_px)
     constraints = np.where(evidence.straight, 2, 4)

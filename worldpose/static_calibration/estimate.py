@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from data_contracts.arrays import Image
+import numpy as np
+
+from data_contracts.arrays import Floats, Image
 from data_contracts.cameras import LensCalibration
 from data_contracts.static_calibration import ClickedMarkings
+from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
-from worldpose.static_calibration.click_outliers import fit_inliers_at_best_noise
-from worldpose.static_calibration.evidence import check_amount, gather_evidence
-from worldpose.static_calibration.explanations import check_determined, find_explanation, try_k3
-from worldpose.static_calibration.fit import build_problem
+from worldpose.static_calibration.evidence import ClickEvidence, check_amount, gather_evidence
+from worldpose.static_calibration.explanations import (
+    check_determined,
+    find_explanation,
+    fit_level_or_rolled,
+    try_k3,
+)
+from worldpose.static_calibration.fit import CameraProblem, build_problem
 from worldpose.static_calibration.initialization import find_start, fit_from_starts
 from worldpose.static_calibration.lens_choice import choose_lens, widen_by_lenses
 from worldpose.static_calibration.line_refinement import refine_and_judge
@@ -48,23 +55,37 @@ def calibrate_camera(
             image after half a turn, it decides the side.
 
     Raises:
-        InputError: a name is unknown, a pixel lies outside the image, names are mirrored, the
-            clicks contradict each other, or they do not determine the camera; the message says
-            which clicks to add.
+        InputError: `method` is `paper`, `start` images no click, the lens is of another image size,
+            a name is unknown, a pixel lies outside the image, names are mirrored, the clicks
+            contradict each other, or they do not determine the camera; the message says which
+            clicks to add.
 
     Note:
         Paper section "Static Camera Calibration".
     """
     stated = settings or StaticCalibrationSettings()
+    if stated.method == "paper":
+        raise InputError(
+            f"{where}: method",
+            expected="worldpose, on whose inliers the paper's method follows",
+            found="paper",
+            todo="Give its result to `worldpose.reference_method.static_calibration.calibrate`, or "
+            "click the camera in a match folder.",
+        )
     own = {} if lens is None else {"distortion": "k1_k2_k3"}
     stated = stated.model_copy(update={"prior": stated.prior.beside(pitch.spec), **own})
     evidence = gather_evidence(pitch, clicked, image_size, stated.sample_spacing_m, where)
     check_amount(evidence, pitch, where)
-    problem = build_problem(evidence, image_size, stated, where=where, lens=lens)
-    near = find_start(problem, stated) if start is None else start.numbers
     if start is not None:
-        near, _ = fit_from_starts(problem, near[None], stated.wrong_click)
-    found = choose_lens(fit_inliers_at_best_noise(problem, near, stated), stated)
+        _check_start(start, evidence, where)
+    problem = build_problem(evidence, image_size, stated, where=where, lens=lens)
+
+    def begin(problem: CameraProblem) -> Floats:
+        if start is None:
+            return find_start(problem, stated)
+        return fit_from_starts(problem, start.numbers[None], stated.wrong_click)[0]
+
+    found = choose_lens(fit_level_or_rolled(problem, begin, stated), stated)
     found = find_explanation(found, pitch, stated)
     check_determined(found, pitch)
     found = try_k3(found)
@@ -78,3 +99,16 @@ def calibrate_camera(
         estimate, pitch = lines.estimate.estimate, pitch.with_surface(lines.estimate.surface)
     report = build_report(estimate, found, lines, pitch, stated.click_noise_px)
     return StaticCalibration(estimate, report)
+
+
+def _check_start(start: Camera, evidence: ClickEvidence, where: str) -> None:
+    """Raise InputError unless a start is one camera that images something of the clicks."""
+    places = np.concatenate([evidence.points_world, evidence.samples_world])
+    found = f"cameras of shape {start.batch_shape}"
+    if start.batch_shape or not np.isfinite(start.project(places)).any():
+        raise InputError(
+            f"{where}: start",
+            expected="one camera near the answer",
+            found=found if start.batch_shape else "a camera that images no clicked marking",
+            todo="Give a single camera that looks at the markings, or none.",
+        )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -39,6 +40,50 @@ _COMPARISON_LOSS: Final = 9.0
 """Cauchy scale of clicks [standard deviations] while mirrored names compete."""
 _MAX_OUTLIER_SHARE: Final = 0.1
 """Maximum share of outliers of a camera that rests on an assumption [1]."""
+
+
+def fit_level_or_rolled(
+    problem: CameraProblem,
+    begin: Callable[[CameraProblem], Floats],
+    stated: StaticCalibrationSettings,
+) -> Explanation:
+    """Return the explanation of the clicks by a camera of any roll, level if that is as probable.
+
+    Before clicks count as outliers or as noisier than stated, and where the prior of the roll holds
+    a camera, a fit with a free roll competes. `begin` returns the start (WIDTH,) of a problem.
+
+    Raises:
+        InputError: only an impossible camera explains the clicks.
+    """
+    free_std, off_level = 1.0, 3.0  # of the sine of the roll; of its prior [standard deviations]
+    found, refused = None, None
+    try:
+        found = fit_inliers_at_best_noise(problem, begin(problem), stated)
+    except InputError as error:
+        refused = error
+    level_std, prior = float(problem.prior[13]), problem.prior.copy()
+    if found is not None:
+        right = found.fit.inliers.all() and found.fit.markings.all()
+        as_stated = found.noise_factor(stated) * found.fit.noise_scale <= 1.0
+        if right and as_stated and abs(found.fit.row[11]) <= off_level * level_std:
+            return found
+    prior[13] = max(free_std, level_std)
+    rolled = replace(problem, prior=prior)
+    with suppress(InputError):
+        other = fit_inliers_at_best_noise(rolled, begin(rolled), stated)
+        if abs(other.fit.row[11]) > off_level * level_std:
+            if found is None:
+                return other
+            own, level = (
+                negative_log_posterior(each, factor=each.noise_factor(stated), with_prior=True)
+                for each in (other, found)
+            )
+            if own + 2.0 * np.log(prior[13] / level_std) < level - CLEAR_GAIN:
+                return other
+    if found is None:
+        assert refused is not None
+        raise refused
+    return found
 
 
 def find_explanation(

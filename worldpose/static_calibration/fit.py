@@ -128,7 +128,7 @@ def build_problem(
     prior += [*known.lens_std, known.k1, 0.0, 0.0]
     if lens is not None:
         reach = (0.5 * np.hypot(width, height) / lens.focal_px) ** 2
-        k1, k2, _, _, k3 = Camera.from_lens(lens).distortion[:5]
+        k1, k2, _, _, k3 = Camera.from_lens(lens, image_size).distortion[:5]
         prior[:2] = [np.log(lens.focal_px), lens.focal_std_px / lens.focal_px]
         prior[2:5] = [*lens.principal_point_px, lens.principal_point_std_px]
         prior[6:9] = [lens.distortion_std] * 3

@@ -221,14 +221,20 @@ def cameras_from_homographies(
     focal_range = (prior.focal * width / spread, prior.focal * width * spread)
     pixels = np.concatenate([evidence.points_image, evidence.drawn_image])
     seen = np.median(pixels, axis=0)
+    rows = []
     # The tolerance covers distortion of a few percent at the border, and the crown's height.
-    found = [
-        camera_from_homography(homography, problem.image_size, seen, focal_range)
-        for homography in homographies(
-            evidence, problem.image_size, 0.012 * width, leave_out=leave_out
-        )
-    ]
-    rows = [camera.numbers for camera in found if camera is not None]
+    for homography in homographies(
+        evidence, problem.image_size, 0.012 * width, leave_out=leave_out
+    ):
+        found = camera_from_homography(homography, problem.image_size, seen, focal_range)
+        several = [found]
+        if found is not None and not focal_range[0] < found.focal[0] < focal_range[1]:
+            # The fit hardly moves along an open focal length, which other terms decide.
+            several = [
+                camera_from_homography(homography, problem.image_size, seen, (focal, focal))
+                for focal in np.geomspace(*focal_range, 9)
+            ]
+        rows += [camera.numbers for camera in several if camera is not None]
     return np.array(rows).reshape(-1, WIDTH)
 
 

@@ -53,7 +53,7 @@ def choose_lens(found: Explanation, stated: StaticCalibrationSettings) -> Explan
     lowest = own - CLEAR_GAIN
     # Lens models, and their numbers of free radial coefficients, besides k1 and k2 of Brown's.
     candidates = ((LensModel.BROWN, 3), (LensModel.FISHEYE, 2), (LensModel.FISHEYE, 3))
-    for model, coefficients in candidates:
+    for model, coefficients in candidates[: 1 if stated.lens_model == "brown" else None]:
         free = np.arange(STEP) < STEP - 3 + coefficients
         prior = as_stated.prior.copy()
         if model == LensModel.FISHEYE:
@@ -115,7 +115,10 @@ def widen_by_lenses(
             continue
         step = np.zeros(STEP)
         rows = by_step[known][:, :, problem.free].reshape(-1, int(problem.free.sum()))
-        step[problem.free] = np.linalg.lstsq(rows, apart[known].ravel())[0]
+        # In standard deviations: a direction that moves no pixel of the pitch gets no step.
+        unit = np.linalg.cholesky(fit.covariance[np.ix_(problem.free, problem.free)])
+        found_step = np.linalg.lstsq(rows @ unit, apart[known].ravel(), rcond=1e-4)[0]
+        step[problem.free] = unit @ found_step
         size = float(np.sqrt(((by_step[known] @ step) ** 2).sum(axis=1).mean()))
         if size > largest:
             widest, largest = step, size

@@ -164,6 +164,13 @@ def build_report(
         drawn.append(MarkingResidual(name, len(off), rms, worst, bool(fit.markings[index])))
     ground_error = ground_error_map(estimate, pitch, settings.map_step_m)
     reasons = _accuracy_reasons(ground_error, fit, settings)
+    # Only a plane seen from straight above leaves more than a fifth to the prior.
+    if (open_focal := float(np.sqrt(estimate.covariance[6, 6]))) > 0.2:
+        reasons.append(
+            f"height {estimate.camera.center[2]:.1f} m and focal length "
+            f"{estimate.camera.focal[0]:.0f} px are open, give or take {open_focal:.0%}: click "
+            "points above the ground, or import a lens (worldpose import --lens)"
+        )
     misfit = describe_misfit(found)
     if reasons and not misfit and scale >= 3.0:
         misfit = (
@@ -172,6 +179,11 @@ def build_report(
         )
     reasons += [misfit] if misfit else []
     decisions = list(found.assumptions)
+    # The heights of the image's axes, right and down, tell the roll unless it looks straight down.
+    right, down = estimate.camera.cam_from_world.rotation[:2, 2]
+    if max(abs(right), down) > 0.1:
+        roll = np.degrees(np.arctan2(-right, -down))
+        decisions.append(f"the camera is rolled by {roll:+.0f} degrees, clockwise from behind")
     if abs(scale - 1.0) > 0.01:
         decisions.append(
             f"the errors of clicks and drawn pixels are {scale:.2g} times the stated noise; the "

@@ -301,11 +301,14 @@ def prior_residuals(c: Floats, prior: Floats, residual: Floats, jacobian: Floats
     # mirrored names would put it.
     residual[6] = (np.log(high) + (z - high) / high - prior[9]) / prior[10]
     far = max(np.sqrt(x * x + y * y), 1.0)
-    residual[7] = (np.log(far) - prior[11]) / prior[12]
+    # Cameras under a roof or on a drone are near the centre spot: the pull outwards ends at two
+    # standard deviations, below the nearest stands.
+    near = -2.0
+    residual[7] = max((np.log(far) - prior[11]) / prior[12], near)
     for k in range(3):
         jacobian[6, 3 + k] = -c[11 + 3 * k] / high / prior[10]
         along = (x * c[9 + 3 * k] + y * c[10 + 3 * k]) / far
-        jacobian[7, 3 + k] = -along / far / prior[12]
+        jacobian[7, 3 + k] = -along / far / prior[12] if residual[7] > near else 0.0
     residual[8] = c[11] / prior[13]
     jacobian[8, 1] = c[17] / prior[13]
     jacobian[8, 2] = -c[14] / prior[13]

@@ -78,7 +78,8 @@ class CameraPrior(Record):
     log_height_std: float = Field(default=0.4, ge=1e-6, le=100)
     """Standard deviation of the height's logarithm [1]."""
     distance_m: float = Field(default=75.0, ge=1e-6, le=10000)
-    """Distance in plan from the centre spot [m]: the stands are 40 to 120 m away."""
+    """Distance in plan from the centre spot [m]: the stands are 40 to 120 m away. Within two
+    standard deviations of it the prior pulls outwards, not from nearer."""
     log_distance_std: float = Field(default=0.35, ge=1e-6, le=100)
     """Standard deviation of the distance's logarithm [1]."""
     roll_std_rad: float = Field(default=0.03, ge=1e-6, le=10)
@@ -148,6 +149,8 @@ class StaticCalibrationSettings(Record):
     reliable majority."""
     distortion: Literal["none", "k1", "k1_k2", "k1_k2_k3"] = "k1_k2"
     """Free radial coefficients."""
+    lens_model: Literal["any", "brown"] = "any"
+    """Models of an unknown lens: Brown's and fisheyes, or Brown's alone."""
     k3_gain: float = Field(default=0.1, ge=1e-6, le=10)
     """Minimum relative reduction of the held-out error to keep k3 [1]."""
     search_cameras: int = Field(default=24, ge=1, le=10000)

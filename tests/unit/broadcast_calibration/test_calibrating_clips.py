@@ -12,7 +12,7 @@ from turning_clip import film_empty_pitch
 
 from data_contracts.broadcast_calibration import FRAME_STATUS, KeyFrame
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint
-from worldpose.broadcast_calibration.estimate import BroadcastClip, calibrate_broadcast
+from worldpose.broadcast_calibration.estimate import BroadcastClip, calibrate_broadcast, track
 from worldpose.broadcast_calibration.given_camera import GivenCamera
 from worldpose.broadcast_calibration.players import People
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
@@ -145,6 +145,15 @@ def test_key_frames_that_the_clip_does_not_have_are_refused(true, pictures, fram
         keys, message = [KeyFrame(frame=2, markings=ClickedMarkings(points=(point,)))], "frame 2"
     with pytest.raises(InputError, match=message):
         calibrate_broadcast(clip.PITCH, BroadcastClip(keys, lambda: iter(pictures), FPS), SETTINGS)
+
+
+@pytest.mark.parametrize("frames", [FRAMES - 1, FRAMES + 3])
+def test_boxes_and_people_have_the_frames_of_the_pictures(true, pictures, frames):
+    nobody = People(np.empty((frames, 0, 17, 3)), np.empty((frames, 0, 17, 2)), FPS)
+    for given in ({"boxes": np.full((frames, 1, 4), np.nan)}, {"people": nobody}):
+        whole = BroadcastClip([clicks(true, 2)], lambda: iter(pictures), FPS, **given)
+        with pytest.raises(InputError, match=f"found {FRAMES} pictures, and data of {frames}"):
+            track(clip.PITCH, whole, SETTINGS)
 
 
 def test_a_cut_is_found_and_refused(true, pictures, bare):

@@ -6,13 +6,21 @@ import cv2
 import numpy as np
 import pytest
 import turning_clip as clip
+from pydantic import ValidationError
 
+from data_contracts.broadcast_calibration import KeyFrame
+from data_contracts.static_calibration import ClickedMarkings
 from worldpose.broadcast_calibration.clip_problem import ClipProblem, TermWeights
 from worldpose.broadcast_calibration.evidence import FlowEvidence, PointEvidence
+from worldpose.broadcast_calibration.key_frames import calibrate_keys
+from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.broadcast_calibration.players import People, estimate_feed_offset
 from worldpose.broadcast_calibration.priors import build_prior
 from worldpose.broadcast_calibration.residuals import linearize
-from worldpose.broadcast_calibration.settings import BroadcastPrior
+from worldpose.broadcast_calibration.settings import (
+    BroadcastCalibrationSettings,
+    BroadcastPrior,
+)
 from worldpose.broadcast_calibration.solver import solve
 from worldpose.broadcast_calibration.tracking import (
     Followed,
@@ -22,8 +30,12 @@ from worldpose.broadcast_calibration.tracking import (
     turn,
 )
 from worldpose.broadcast_calibration.uncertainty import pool_centers
-from worldpose.errors import DegenerateError
+from worldpose.errors import DegenerateError, InputError
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.lens_models import LensModel
 from worldpose.ingest.clock import ImageClock, rows_at
+from worldpose.simulation.scene import look_at
+from worldpose.static_calibration.estimate import calibrate_camera
 
 
 def pairs_of(camera, rng):
@@ -32,6 +44,53 @@ def pairs_of(camera, rng):
         Followed(flow.start[flow.frame == t], flow.end[flow.frame == t], 1.0)
         for t in range(len(camera) - 1)
     ]
+
+
+@pytest.mark.parametrize(
+    ("center", "distance"),
+    [
+        ((0.0, -75.0, 17.0), 75.0),
+        ((0.0, 75.0, 17.0), 75.0),  # on the far side
+        ((-80.0, 0.0, 17.0), 80.0),  # behind a goal
+        ((30.0, 40.0, 17.0), 50.0),
+        ((0.0, 0.0, 17.0), 20.0),  # on a cable: its standard deviation
+    ],
+)
+def test_a_mean_center_on_any_side_is_a_prior_of_key_frames(center, distance):
+    prior = BroadcastCalibrationSettings(prior=BroadcastPrior(center_m=center)).key_frame.prior
+    assert (prior.distance_m, prior.height_m) == (distance, 17.0)
+
+
+@pytest.mark.parametrize("height", [0.0, -2.0])
+def test_a_mean_center_is_above_the_pitch(height):
+    with pytest.raises(ValidationError, match="center_m"):
+        BroadcastPrior(center_m=(0.0, -75.0, height))
+
+
+def test_key_frames_of_a_wide_lens_keep_the_model_of_the_clip():
+    pose, size = look_at(np.array([0.0, -60.0, 18.0]), np.zeros(3), 0.0), (1920, 1080)
+    matrix, middle = np.diag([900.0, 900.0, 1.0]), (959.5, 539.5)
+    matrix[:2, 2] = middle
+    true = Camera.from_matrices(
+        matrix, (-0.25, 0.07, 0.0, 0.0, -0.008), pose.rotation, pose.translation, size
+    )
+    seen = true.project(clip.PITCH.positions(list(clip.PITCH.points)))
+    seen += np.random.default_rng(1).normal(0.0, 0.7, seen.shape)
+    inside = ((seen > 5.0) & (seen < np.array(size) - 6.0)).all(axis=1)
+    pixels = {name: seen[n] for n, name in enumerate(clip.PITCH.points) if inside[n]}
+    clicked = ClickedMarkings.model_validate(
+        {"points": [{"name": name, "xy": tuple(xy)} for name, xy in pixels.items()]}
+    )
+    # The clicks alone are those of a fisheye, whose k1, k2 and k3 are another polynomial's.
+    alone = calibrate_camera(clip.PITCH, clicked, size).estimate.camera
+    assert alone.lens_model == LensModel.FISHEYE
+    with pytest.raises(InputError, match="model brown, found fisheye"):
+        MovingCamera.from_batch(Camera.stack([alone]))
+    key = KeyFrame(frame=0, markings=clicked)
+    found = calibrate_keys(clip.PITCH, [key], size, {}, BroadcastCalibrationSettings(), "clip")
+    places = clip.PITCH.positions(list(pixels))
+    off = np.linalg.norm(found.camera.camera[0].project(places) - true.project(places), axis=1)
+    assert off.max() < 20.0  # k1, k2 and k3 of the fisheye, read as Brown's: over 300 px
 
 
 def test_a_turn_and_a_zoom_are_found_among_movers():

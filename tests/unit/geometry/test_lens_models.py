@@ -7,6 +7,7 @@ from camera_builders import plain_camera
 from run_records import calibration
 
 from data_contracts.cameras import COEFFICIENTS
+from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_fit import fit_brown_lens
 from worldpose.geometry.lens_models import (
@@ -217,9 +218,38 @@ def test_browns_nearest_lens_states_its_largest_error(model, lens):
     stated = {"focal_px": (700.0, 700.0), "principal_point_px": (319.5, 239.5)}
     stated |= {"image_size": (640, 480), "lens_model": model, "distortion": lens}
     camera = Camera.from_calibration(calibration("a", **stated))
-    near, error = fit_brown_lens(camera)
+    near, told = fit_brown_lens(camera)
+    error = told["max_error_px"]
+    assert told["max_error_beyond_px"] == 0.0  # of no pixel: the fit is to the whole image
     rng = np.random.default_rng(0)
     rays = camera.unproject(rng.uniform([0, 0], [639, 479], (500, 2)))
     points = rays.origins + 5.0 * rays.directions
     off = np.linalg.norm(near.project(points) - camera.project(points), axis=1)
     assert 0.2 * error < off.max() <= 1.01 * error < 0.1
+
+
+def test_the_corners_of_a_very_wide_fisheye_do_not_spoil_the_middle_of_browns_lens():
+    # Equidistant with k1 = 0: the corners, 400 px off, are at 400 / 300 rad = 76 degrees.
+    stated = {"focal_px": (300.0, 300.0), "principal_point_px": (319.5, 239.5)}
+    stated |= {"image_size": (640, 480), "lens_model": "fisheye"}
+    camera = Camera.from_calibration(calibration("a", distortion=(0.0,) * 4, **stated))
+    near, told = fit_brown_lens(camera)
+    assert told["max_error_px"] <= 2.0
+    assert told["max_error_beyond_px"] is None  # the polynomial folds before the corners
+    limit = told["fitted_angle_deg"]
+    assert 45.0 < limit < 76.5
+    # Pixels on a circle about the middle are `radius / 300` rad off the axis.
+    turn = np.linspace(0.0, 2.0 * np.pi, 16)
+    for share in (0.1, 0.5, 0.95):
+        radius = 300.0 * np.radians(share * limit)
+        pixels = np.array([319.5, 239.5]) + radius * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        pixels = pixels[(np.abs(pixels[:, 1] - 239.5) <= 240.0)]
+        rays = camera.unproject(pixels)
+        off = near.project(rays.origins + 5.0 * rays.directions) - pixels
+        assert np.linalg.norm(off, axis=1).max() <= 1.05 * told["max_error_px"]
+    # At 180 px per rad, half of the image is beyond 70 degrees.
+    wider = Camera.from_calibration(
+        calibration("a", distortion=(0.0,) * 4, **stated | {"focal_px": (180.0, 180.0)})
+    )
+    with pytest.raises(InputError, match="half of the image"):
+        fit_brown_lens(wider)

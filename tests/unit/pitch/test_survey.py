@@ -93,9 +93,30 @@ def test_a_left_handed_frame_is_refused_unless_it_is_said():
 @pytest.mark.parametrize(("unit", "said"), [(1 / 0.9144, "yards"), (1e3, "")])
 def test_other_units_are_named(unit, said):
     survey = surveyed()
-    with pytest.raises(InputError, match=f"times too large.*{said}") as caught:
+    with pytest.raises(InputError, match=f"times the true length.*{said}") as caught:
         fit_survey(Survey("survey.csv", survey.names, survey.places * unit))
     assert caught.value.expected == "metres"
+
+
+@pytest.mark.parametrize(
+    ("template", "size"),
+    [("football", (70.0, 50.0)), ("football", (64.0, 45.0)), ("futsal", (25.0, 16.0))],
+)
+def test_a_full_survey_of_a_small_pitch_is_in_metres(template, size):
+    true = PitchTemplate.from_spec(PitchSpec(template=template, length=size[0], width=size[1]))
+    places = true.positions(list(true.points)) @ [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0, 0, 1.0]]
+    fit = fit_survey(Survey("survey.csv", tuple(true.points), places, template))
+    assert (fit.pitch.length, fit.pitch.width) == pytest.approx(size, abs=1e-3)
+    assert fit.scale == pytest.approx(1.0, abs=1e-4)
+    # Two thirds of the usual pitch is another unit: its penalty areas are smaller than prescribed.
+    usual = PitchTemplate.from_spec(PitchSpec(template=template))
+    places = usual.positions(list(usual.points)) * 0.65
+    with pytest.raises(InputError):
+        fit_survey(Survey("survey.csv", tuple(usual.points), places, template))
+    # Four corners do not tell.
+    corners = true.positions(CORNERS)
+    with pytest.raises(InputError, match=r"0\.\d+ of the true length.*Corners alone"):
+        fit_survey(Survey("survey.csv", tuple(CORNERS), corners, template))
 
 
 def test_the_scale_is_reported_and_taken_out_on_request():

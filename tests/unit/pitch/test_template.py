@@ -204,6 +204,20 @@ def test_another_surface_moves_all_but_surveyed_heights():
     assert moved.by_surface(["corner_left_far", "corner_left_near"]).tolist() == [[0, 0], [-1, -1]]
 
 
+@pytest.mark.parametrize("spacing", [0.0, -1.0, math.nan])
+@pytest.mark.parametrize("name", ["halfway_line", "center_circle", "crossbar_left"])
+def test_samples_need_a_positive_spacing(standard, name, spacing):
+    with pytest.raises(InputError, match="expected a positive distance"):
+        standard.marking_points(name, spacing)
+    assert len(standard.marking_points(name, math.inf)) >= 2  # the ends alone
+
+
+@pytest.mark.parametrize("surface", [[math.nan, 0.0], [0.1, math.inf], [0.1], 0.1])
+def test_a_surface_is_two_finite_numbers(standard, surface):
+    with pytest.raises(InputError, match="a finite crown and end fall"):
+        standard.with_surface(surface)
+
+
 def test_derivatives_of_samples_are_those_of_their_heights():
     pitch = PitchTemplate.from_spec(PitchSpec(points={"corner_right_near": (52.5, -34.0, -0.1)}))
     change = np.array([-0.05, 0.25])
@@ -261,6 +275,16 @@ def test_markings_are_on_the_court_and_arcs_end_at_their_lines(template):
             for part in ("back", "front"):
                 gaps = np.linalg.norm(ends - found.points[f"{name}_{part}"], axis=1)
                 assert gaps.min() == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_second_penalty_mark_of_the_smallest_court_lies_in_its_centre_circle():
+    small = PitchTemplate.from_spec(PitchSpec(template="futsal", length=25.0, width=16.0))
+    assert small.points["second_penalty_mark_right"].tolist() == [2.5, 0.0, 0.0]  # circle: 3 m
+    # Twice the 10 m of the mark, and the areas' front edges at 6 m with the 3 m of the circle.
+    for marks, least in (({}, "20"), ({"second_penalty_mark_distance": 0.0}, "18")):
+        spec = PitchSpec(template="futsal", length=18.0, width=16.0, dimensions=marks)
+        with pytest.raises(InputError, match=f"more than {least} x"):
+            PitchTemplate.from_spec(spec)
 
 
 def test_dimensions_replace_those_of_the_template_and_zero_is_not_there():

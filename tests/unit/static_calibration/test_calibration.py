@@ -1,5 +1,7 @@
 """A camera is calibrated by clicks of known markings, and states its errors."""
 
+from dataclasses import replace
+
 import clicking_people as people
 import numpy as np
 import opencv_rig as rig
@@ -11,6 +13,8 @@ from scipy.stats import chi2
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.annotations import click, survey
 from worldpose.simulation.renderer import render_pitch
@@ -46,6 +50,21 @@ def of(clicked, **settings):
 def test_clicks_that_no_image_has_are_refused(clicked, message):
     with pytest.raises(InputError, match=message):
         of(clicked)
+
+
+def test_the_method_of_the_paper_is_not_replaced_by_another():
+    with pytest.raises(InputError, match=r"found paper.*reference_method"):
+        of(people.points(people.visible(people.seat(0)[0])), method="paper")
+
+
+def test_a_start_is_one_camera_that_looks_at_the_markings():
+    camera, _ = people.seat(0)
+    clicked = people.points(people.visible(camera))
+    back = camera.cam_from_world.rotation * [[-1.0], [1.0], [-1.0]]  # half a turn about its y
+    away = replace(camera, cam_from_world=Rigid(back, -back @ camera.center))
+    for start, said in ((away, "images no clicked"), (Camera.stack([camera] * 2), r"\(2,\)")):
+        with pytest.raises(InputError, match=f"start: expected one camera.*{said}"):
+            calibrate_camera(PITCH, clicked, SIZE, start=start)
 
 
 def test_three_points_are_too_few_and_the_message_names_others():
@@ -117,6 +136,59 @@ def test_exact_clicks_give_the_camera_back(index):
     assert people.ground_errors(result.estimate.camera, camera, places).max() < 5e-3
 
 
+@pytest.mark.parametrize("x", [0.0, 3.0])
+def test_a_camera_that_looks_straight_down_says_that_its_height_is_open(x):
+    hall, size = PitchTemplate.from_spec(PitchSpec(template="basketball")), people.SIZE
+    camera = people.pinhole((x, 0.01, 9.0), (x, 0.0, 0.0), 700.0, size)
+    rng, clicked = np.random.default_rng(5), {}
+    for name, place in hall.points.items():
+        pixel = camera.project(place[None])[0] + rng.standard_normal(2)
+        if place[2] == 0.0 and ((pixel > 5.0) & (pixel < np.array(size) - 6.0)).all():
+            clicked[name] = pixel
+    found = calibrate_camera(hall, people.points(clicked), size)
+    # The ground has 700 / 9 pixels a metre. In logarithms the priors are 4.8 +- 0.4 for the height
+    # and 3072 px +- 0.6 for the focal length: together 9.2 m give or take a third.
+    seen, known = found.estimate.camera, found.report
+    assert seen.focal[0] / seen.center[2] == pytest.approx(700.0 / 9.0, rel=0.01)
+    assert seen.center[2] == pytest.approx(9.2, rel=0.05)
+    assert np.sqrt(found.estimate.covariance[6, 6]) == pytest.approx(0.33, abs=0.05)
+    assert any("height" in each and "open" in each for each in known.contradictions)
+    # From the side, the same points tell both.
+    aside = people.pinhole((x, -14.0, 6.0), (x, 0.0, 0.0), 700.0, size)
+    clicked = {}
+    for name, place in hall.points.items():
+        pixel = aside.project(place[None])[0] + rng.standard_normal(2)
+        if ((pixel > 5.0) & (pixel < np.array(size) - 6.0)).all():
+            clicked[name] = pixel
+    found = calibrate_camera(hall, people.points(clicked), size)
+    assert found.estimate.camera.center[2] == pytest.approx(6.0, rel=0.02)
+    assert not any("open" in each for each in found.report.reasons)
+
+
+@pytest.mark.parametrize(
+    ("roll", "size"), [(90.0, people.SIZE), (-90.0, (1080, 1920)), (35.0, SIZE)]
+)
+def test_a_rolled_camera_keeps_its_right_clicks_and_says_its_roll(roll, size):
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        place, aim = (rng.uniform(-30.0, 30.0), -80.0, 18.0), (rng.uniform(-30.0, 30.0), 0.0, 0.0)
+        camera = people.pinhole(place, aim, 1600.0, size, roll=np.radians(roll))
+        pixels = camera.project(PITCH.positions(list(PITCH.points)))
+        inside = ((pixels > 5.0) & (pixels < np.array(size) - 6.0)).all(axis=1)
+        chosen = rng.permutation(np.flatnonzero(inside))[:8]
+        pixels = pixels + 0.7 * rng.standard_normal(pixels.shape)
+        clicked = people.points({list(PITCH.points)[n]: pixels[n] for n in chosen})
+        found = calibrate_camera(PITCH, clicked, size)
+        assert found.report.wrong == ()
+        right, down = camera.cam_from_world.rotation[:2, 2]
+        said = f"rolled by {np.degrees(np.arctan2(-right, -down)):+.0f} degrees"
+        assert any(said in each for each in found.report.decisions)
+        assert np.abs(found.estimate.camera.center - camera.center).max() < 8.0
+    # Seats of the stadium are level.
+    level = of(people.click(*people.seat(0)).clicked)
+    assert not any("rolled" in each for each in level.report.decisions)
+
+
 def test_a_marking_under_another_ones_name_is_named_and_left_out():
     camera, rng = people.seat(1)
     drawn = list(people.draw(camera, list(PITCH.lines), rng, noise=0.5))
@@ -128,6 +200,19 @@ def test_a_marking_under_another_ones_name_is_named_and_left_out():
     assert f"{drawn[wrong].name} left out: its pixels lie on {other.name}" in str(
         result.report.decisions
     )
+
+
+def test_points_that_contradict_all_markings_are_tried_without_a_warning(recwarn):
+    camera, rng = people.seat(1)
+    names = ["touch_line_far", "halfway_line", "penalty_area_left_front"]
+    away = [
+        {"name": m.name, "xy": [(x, y + 60.0) for x, y in m.xy]}
+        for m in people.draw(camera, names, rng)
+    ]
+    clicked = people.click(camera, rng, count=9).clicked
+    found = of(ClickedMarkings(points=clicked.points, drawn=away))
+    assert not any("empty slice" in str(each.message) for each in recwarn)
+    assert {each["name"] for each in away} <= set(found.report.wrong)
 
 
 def test_a_wrong_click_is_found_and_no_other():

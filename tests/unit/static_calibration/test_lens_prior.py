@@ -13,7 +13,9 @@ from clicking_people import (
     wide_camera,
 )
 
+from worldpose.errors import InputError
 from worldpose.static_calibration.estimate import calibrate_camera
+from worldpose.static_calibration.from_paint.proposal import propose_camera
 
 
 def test_a_known_lens_lowers_the_ground_error_of_few_clicks():
@@ -34,6 +36,17 @@ def test_a_known_lens_lowers_the_ground_error_of_few_clicks():
                 assert any("the given lens" in each for each in found.report.decisions)
     # Seen over ten seeds: 0.32 m and 1.71 m (medians).
     assert np.median(with_lens) < 0.5 * np.median(without)
+
+
+def test_a_lens_of_images_of_another_size_is_refused():
+    camera, rng = wide_camera(1)
+    clicked = click(camera, rng, count=6).clicked
+    small = lens_of(camera, rng).model_copy(update={"image_size": (1280, 720)})
+    said = "image_size 1920 x 1080, that of the image, found 1280 x 720"
+    with pytest.raises(InputError, match=said):
+        calibrate_camera(PITCH, clicked, SIZE, lens=small)
+    with pytest.raises(InputError, match=said):
+        propose_camera(np.zeros((1080, 1920, 3), np.uint8), PITCH, side="near", lens=small)
 
 
 def test_a_lens_that_the_clicks_contradict_makes_the_camera_weak():
