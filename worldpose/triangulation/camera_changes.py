@@ -380,6 +380,19 @@ def is_same_change(one: CameraChange, other: CameraChange, fps: float) -> bool:
     return same and near and other.is_explained
 
 
+def explains_clock(found: Sequence[CameraChange], known: CameraChange) -> bool:
+    """Return whether changes of a camera's clock show how late it is after a known step.
+
+    The tracker tells a step wherever people cease to meet; a drift may be the reason.
+    """
+    last = known.first_frame + known.frame_count
+    frame = np.arange(known.first_frame if known.frame is None else known.frame, last)
+    own = [each for each in found if each.kind == "clock" and each.camera == known.camera]
+    late = sum(each.late_frames * float(_shares(each, frame).mean()) for each in own)
+    near = abs(late - known.late_frames) <= max(1.0, 0.25 * abs(known.late_frames))
+    return known.kind == "clock" and bool(own) and near
+
+
 def is_by_chance(change: CameraChange) -> bool:
     """Return whether a change is more than a knock: people who agree nowhere seem to show it."""
     return abs(change.zoom) > 0.1 or abs(change.roll_rad) > np.radians(10.0)

@@ -12,7 +12,13 @@ from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import HEALTH_MEASURES, CameraChange
 from worldpose.camera_consistency.health import CameraHealth, judge_health, measure_health
 from worldpose.geometry.cameras import Camera
-from worldpose.triangulation.camera_changes import correct_views, find_changes, sum_clip
+from worldpose.triangulation.camera_changes import (
+    change_record,
+    correct_views,
+    explains_clock,
+    find_changes,
+    sum_clip,
+)
 from worldpose.triangulation.change_parts import Part, fit_parts
 from worldpose.triangulation.change_sums import ChangeSums
 from worldpose.triangulation.clock_courses import (
@@ -332,6 +338,16 @@ def test_a_known_change_is_taken_back_within_its_clip(change, moved):
     shift = corrected - pixels
     np.testing.assert_allclose(shift[:, 1, 0, 0, 0], -np.array(moved), atol=1e-5)
     assert not shift[:, 0].any()
+
+
+@pytest.mark.parametrize(("late", "is_explained"), [(3.5, True), (-3.5, False), (9.0, False)])
+def test_a_drift_explains_a_step_that_the_tracker_tells(cameras, late, is_explained):
+    (found,) = explain(cameras, view(cameras, fast))
+    drift = change_record(found, "b", np.arange(FRAMES))
+    told = drift.model_copy(update={"frame": 180, "late_frames": late})
+    assert explains_clock([drift], told) == is_explained
+    assert not explains_clock([drift], told.model_copy(update={"camera": "a"}))
+    assert not explains_clock([KNOCK], told)
 
 
 def test_cameras_that_all_sway_agree_with_nobody(cameras):
