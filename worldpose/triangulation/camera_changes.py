@@ -284,7 +284,7 @@ def refine_change(
         parts = [*parts[:-1], *fit_sizes(sums, [*parts[:-1], *taken], len(frame))[-1:]]
     std = spreads(sums, parts[-1:], len(frame))[0]
     measured = _measure(parts[-1], std, cameras[camera], len(frame))
-    return join_changes(known, change_record(measured, known.camera, frame))
+    return join_changes(cameras[camera], known, change_record(measured, known.camera, frame))
 
 
 def move_back(pixels: Floats, camera: Camera, amount: Floats) -> Floats:
@@ -398,10 +398,24 @@ def is_by_chance(change: CameraChange) -> bool:
     return abs(change.zoom) > 0.1 or abs(change.roll_rad) > np.radians(10.0)
 
 
-def join_changes(first: CameraChange, then: CameraChange) -> CameraChange:
-    """Return a change of a view with the little that was found after its correction."""
-    x, y, zoom, roll = (_view_amount(first) + _view_amount(then)).tolist()
-    return then.model_copy(update={"shift_px": (x, y), "zoom": zoom, "roll_rad": roll})
+def join_changes(camera: Camera, first: CameraChange, then: CameraChange) -> CameraChange:
+    """Return a change of a view with the little that was found after its correction.
+
+    Turns do not add up: after one of two degrees, a roll of one degree moves the view by another
+    0.3 mrad.
+    """
+    motions = [_view_motion(camera, _view_amount(each)) for each in (first, then)]
+    motion = motions[0] @ motions[1]
+    motion /= np.linalg.norm(motion[2])
+    grown = float(np.linalg.norm(motion[:2], axis=1).mean())
+    turn = Rotation.from_matrix(motion / [[grown], [grown], [1.0]]).as_rotvec()
+    amount = np.array([turn[1], -turn[0], grown - 1.0, turn[2]])
+    amount[:2] *= camera.focal
+    # A zoom after a turn is no turn after a zoom: the middle of the image counts.
+    wanted, turned = (each[:2, 2] / each[2, 2] for each in (motion, _view_motion(camera, amount)))
+    x, y = (amount[:2] + camera.focal * (wanted - turned) / grown).tolist()
+    found = {"shift_px": (x, y), "zoom": grown - 1.0, "roll_rad": float(turn[2])}
+    return then.model_copy(update=found)
 
 
 def _view_amount(change: CameraChange) -> Floats:

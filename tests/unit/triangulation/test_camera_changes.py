@@ -17,6 +17,8 @@ from worldpose.triangulation.camera_changes import (
     correct_views,
     explains_clock,
     find_changes,
+    join_changes,
+    move_on,
     sum_clip,
 )
 from worldpose.triangulation.change_parts import Part, fit_parts
@@ -338,6 +340,16 @@ def test_a_known_change_is_taken_back_within_its_clip(change, moved):
     shift = corrected - pixels
     np.testing.assert_allclose(shift[:, 1, 0, 0, 0], -np.array(moved), atol=1e-5)
     assert not shift[:, 0].any()
+
+
+def test_a_far_knock_and_what_its_correction_leaves_are_one_motion():
+    far = KNOCK.model_copy(update={"frame": 10, "shift_px": (60.0, -50.0)})
+    rest = far.model_copy(update={"shift_px": (2.0, 1.0), "zoom": -0.003, "roll_rad": 0.02})
+    corner = [50.0, 60.0]
+    pixels = np.array([[CENTER, corner, 2.0 * CENTER - corner]])
+    both = move_on(pixels, np.array([12]), CAMERA, [far, rest])
+    joined = move_on(pixels, np.array([12]), CAMERA, [join_changes(CAMERA, far, rest)])
+    np.testing.assert_allclose(joined, both, atol=0.1)
 
 
 @pytest.mark.parametrize(("late", "is_explained"), [(3.5, True), (-3.5, False), (9.0, False)])
