@@ -264,7 +264,7 @@ def refine_change(
     camera: int,
     known: CameraChange,
 ) -> CameraChange:
-    """Return a known sudden change of a view with what people show who were tracked through it.
+    """Return a known change of a view with what people show who were tracked through it.
 
     Args:
         cameras: batch (cameras,), at least three.
@@ -273,11 +273,15 @@ def refine_change(
         camera: index of the camera.
         known: its change.
     """
-    row = int(np.searchsorted(people.frame, known.frame or 0))
     frame = np.asarray(people.frame, dtype=np.int64)
     parts = [Part(c, "constant", 0, (0.0,)) for c in range(len(cameras.focal))]
-    parts.append(Part(camera, "step", row, (0.0,) * 4))
-    near = slice(max(0, row - round(6.0 * fps)), row + round(6.0 * fps))
+    if known.frame is None:
+        parts.append(Part(camera, "drift", 0, (0.0,) * 4))
+        near = slice(None)
+    else:
+        row = int(np.searchsorted(frame, known.frame))
+        parts.append(Part(camera, "step", row, (0.0,) * 4))
+        near = slice(max(0, row - round(6.0 * fps)), row + round(6.0 * fps))
     for _ in range(4):
         taken = parts[-1:]
         sums = sum_clip(cameras, people, fps, np.arange(len(frame)), taken, near=near)

@@ -19,6 +19,7 @@ from worldpose.triangulation.camera_changes import (
     find_changes,
     join_changes,
     move_on,
+    refine_change,
     sum_clip,
 )
 from worldpose.triangulation.change_parts import Part, fit_parts
@@ -340,6 +341,18 @@ def test_a_known_change_is_taken_back_within_its_clip(change, moved):
     shift = corrected - pixels
     np.testing.assert_allclose(shift[:, 1, 0, 0, 0], -np.array(moved), atol=1e-5)
     assert not shift[:, 0].any()
+
+
+def test_what_people_show_of_a_slow_change_is_that_of_the_whole_clip(cameras):
+    update = {"camera": "a", "frame": None, "first_frame": 0, "frame_count": FRAMES}
+    known = KNOCK.model_copy(update=update | {"shift_px": (0.0, 12.0)})
+    people = view(cameras, sink)
+    pixels = np.array(people.keypoints)
+    own = pixels[:, [BAD]]
+    pixels[:, [BAD]] = correct_views(own, people.frame, {"a": cameras[BAD]}, [known])
+    found = refine_change(cameras, replace(people, keypoints=pixels), FPS, BAD, known)
+    assert found.frame is None
+    np.testing.assert_allclose(found.shift_px, [0.0, 20.0], atol=0.6)
 
 
 def test_a_far_knock_and_what_its_correction_leaves_are_one_motion():
