@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -199,13 +200,25 @@ def _describe_changes(
     """Return sentences about cameras that change, and others whose people meet nobody any more."""
     lone = find_lone_views(clip.cameras, clip.detections, tracks.joints, clip.fps)
     explained = {change.camera for change in changes}
-    return [f"{describe_change(change)}." for change in changes] + [
+    return [_describe_tracked(change) for change in changes] + [
         f"camera {clip.camera_ids[c]}: from frame {clip.detections.frame[row]} on most of its "
         "people meet nobody, though other cameras place people in its view. Look whether it moved, "
         "or its clock changed."
         for c, row in lone.items()
         if clip.camera_ids[c] not in explained
     ]
+
+
+def _describe_tracked(change: CameraChange) -> str:
+    """Return a sentence about a change that the tracker tells: it knows no cause of an offset."""
+    if change.kind == "view":
+        return f"{describe_change(change)}."
+    when = "later" if change.late_frames > 0.0 else "earlier"
+    return (
+        f"camera {change.camera}: near frame {change.frame} its people cease to meet those of the "
+        f"others, and then do {abs(change.late_frames):.0f} match frames {when}: its clock steps "
+        "or drifts. worldpose synchronize proposes offsets that change with it."
+    )
 
 
 def _doubts(
@@ -243,8 +256,18 @@ def _follow_changes(
         if changes:
             people = clip.detections.assign_people(tracks.detection_index)
             camera = clip.camera_ids.index(changes[-1].camera)
-            changes[-1] = refine_change(clip.cameras, people, clip.fps, camera, changes[-1])
-            if is_by_chance(changes[-1]):
+            before, after = (
+                changes[-1],
+                refine_change(clip.cameras, people, clip.fps, camera, changes[-1]),
+            )
+            # Just before and after it, people show nothing of a change that is no sudden one.
+            is_gone = math.hypot(*after.shift_px) < 0.25 * math.hypot(*before.shift_px)
+            if is_gone and before.frame is not None:
+                changes[-1] = _slow_change(before)
+                clip = open_clip(inputs, further=changes)
+                continue
+            changes[-1] = after
+            if is_gone or is_by_chance(after):
                 clip = open_clip(inputs, further=changes[:-1])
                 return clip, track(clip), tuple(changes[:-1])
             clip = open_clip(inputs, further=changes)
@@ -260,6 +283,14 @@ def _follow_changes(
             return clip, tracks, (*changes, *(each for each in found if each.kind == "clock"))
         changes.append(views[0])
         clip = open_clip(inputs, further=changes)
+
+
+def _slow_change(change: CameraChange) -> CameraChange:
+    """Return a sudden change as one that grows over the clip to what is usual after its moment."""
+    assert change.frame is not None
+    begun = (change.frame - change.first_frame) / max(1.0, change.frame_count - 1.0)
+    x, y = (2.0 * each / (1.0 + begun) for each in change.shift_px)
+    return change.model_copy(update={"frame": None, "shift_px": (x, y)})
 
 
 def _pitch(inputs: UnitInputs) -> PitchTemplate | None:

@@ -33,6 +33,7 @@ from worldpose.triangulation.camera_changes import (
     MeasuredChange,
     change_record,
     describe_change,
+    explains_clock,
     find_changes,
     is_by_chance,
     is_same_change,
@@ -221,6 +222,7 @@ def _find_changes(
             change = change.model_copy(update={"is_explained": False})
         if not any(is_same_change(one, change, clip.fps) for one in known):
             new.append(change)
+    known = [each for each in known if not explains_clock(new, each)]
     if not new and np.median(health.misfit) > 3.0:
         warnings.append(
             "no person agrees with the views: all cameras move within the clip, each in "
@@ -228,7 +230,7 @@ def _find_changes(
             "calibration are wrong. Give videos without stabilisation, or better 2D poses."
         )
     warnings += [f"{describe_change(change)}." for change in new]
-    clocks = [change for change in new if change.kind == "clock"]
+    clocks = [change for change in (*known, *new) if change.kind == "clock"]
     result.figures |= {CLOCK_CHANGE + each.camera: each.late_frames for each in clocks}
     spoilt = sorted({each.camera for each in new if each.kind == "clock" or not each.is_explained})
     if len(names) - len(spoilt) < 3 < len(names):

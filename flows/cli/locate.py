@@ -250,8 +250,9 @@ def synchronize(
     """Find the clock offsets of the static cameras from moving people, and propose offset_frames.
 
     The cameras must be calibrated, and nothing must be known of their clocks. The command computes
-    the match up to the 2D poses first. The offset of the first camera that it can tell stays, and
-    --apply writes the others. A clock that drifts or steps has pairs [match frame, offset].
+    the match up to the 2D poses first. The offset of the first camera whose clock does not change
+    stays, and --apply writes the others. A clock that drifts or steps has pairs [match frame,
+    offset].
 
     Example: worldpose synchronize matches/lab --plot clocks.svg --apply
 

@@ -159,14 +159,19 @@ def propose(
     c: int,
     found: Synchronization,
 ) -> Proposal:
-    """Return the proposal of a camera: the first one of its group keeps its offset."""
+    """Return the proposal of a camera.
+
+    The first one of its group whose clock does not change keeps its offset, so that one drift is
+    not made that of all others.
+    """
     name = names[c]
     unit, stated = unit_frames(spec, name), spec.camera(name).offset_frames
     if not isinstance(stated, tuple):
         stated = int(stated)
     if not np.isfinite(found.late[c]):
         return Proposal(name, stated, None, None, stated, found.reasons[c])
-    first = next(group[0] for group in found.groups if c in group)
+    group = next(each for each in found.groups if c in each)
+    first = next((each for each in group if len(courses[each]) == 1), group[0])
     reference = courses[first]
     pairs = unit.offset if isinstance(unit.offset, tuple) else ()
     changes = [row for course in (courses[c], reference) for row, _ in course if len(course) > 1]

@@ -143,6 +143,18 @@ def test_offsets_are_in_the_cameras_own_frames_for_the_whole_match(
     np.testing.assert_allclose(row.proposed, proposed, atol=0.02)
 
 
+def test_a_first_camera_that_drifts_changes_no_other_offset():
+    cameras = tuple(CameraSpec(id=name, width=9, height=9) for name in "abc")
+    clip = ClipSpec(id="clip", frame_count=1001)
+    spec = MatchSpec(match_id="m", fps=50.0, cameras=cameras, clips=(clip,))
+    std, empty = np.full(3, 0.05), np.empty(0)
+    found = Synchronization(np.zeros(3), std, ("", "", ""), empty, empty, ((0, 1, 2),))
+    courses = [[(0, 0.0), (1000, 8.0)], [(0, 0.0)], [(0, 3.0)]]
+    rows = [propose(spec, clip, list("abc"), courses, c, found) for c in range(3)]
+    assert [row.proposed for row in rows] == [((0, 0.0), (1000, -8.0)), 0, -3]
+    assert {row.relative_to for row in rows} == {"b"}
+
+
 SIZE = (640, 480)
 FOCAL = 520.0
 OPTIONS = ("--columns", "7", "--rows", "4", "--square", "0.06")

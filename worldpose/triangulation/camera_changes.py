@@ -264,7 +264,7 @@ def refine_change(
     camera: int,
     known: CameraChange,
 ) -> CameraChange:
-    """Return a known sudden change of a view with what people show who were tracked through it.
+    """Return a known change of a view with what people show who were tracked through it.
 
     Args:
         cameras: batch (cameras,), at least three.
@@ -273,18 +273,22 @@ def refine_change(
         camera: index of the camera.
         known: its change.
     """
-    row = int(np.searchsorted(people.frame, known.frame or 0))
     frame = np.asarray(people.frame, dtype=np.int64)
     parts = [Part(c, "constant", 0, (0.0,)) for c in range(len(cameras.focal))]
-    parts.append(Part(camera, "step", row, (0.0,) * 4))
-    near = slice(max(0, row - round(6.0 * fps)), row + round(6.0 * fps))
+    if known.frame is None:
+        parts.append(Part(camera, "drift", 0, (0.0,) * 4))
+        near = slice(None)
+    else:
+        row = int(np.searchsorted(frame, known.frame))
+        parts.append(Part(camera, "step", row, (0.0,) * 4))
+        near = slice(max(0, row - round(6.0 * fps)), row + round(6.0 * fps))
     for _ in range(4):
         taken = parts[-1:]
         sums = sum_clip(cameras, people, fps, np.arange(len(frame)), taken, near=near)
         parts = [*parts[:-1], *fit_sizes(sums, [*parts[:-1], *taken], len(frame))[-1:]]
     std = spreads(sums, parts[-1:], len(frame))[0]
     measured = _measure(parts[-1], std, cameras[camera], len(frame))
-    return join_changes(known, change_record(measured, known.camera, frame))
+    return join_changes(cameras[camera], known, change_record(measured, known.camera, frame))
 
 
 def move_back(pixels: Floats, camera: Camera, amount: Floats) -> Floats:
@@ -380,15 +384,42 @@ def is_same_change(one: CameraChange, other: CameraChange, fps: float) -> bool:
     return same and near and other.is_explained
 
 
+def explains_clock(found: Sequence[CameraChange], known: CameraChange) -> bool:
+    """Return whether changes of a camera's clock show how late it is after a known step.
+
+    The tracker tells a step wherever people cease to meet; a drift may be the reason.
+    """
+    last = known.first_frame + known.frame_count
+    frame = np.arange(known.first_frame if known.frame is None else known.frame, last)
+    own = [each for each in found if each.kind == "clock" and each.camera == known.camera]
+    late = sum(each.late_frames * float(_shares(each, frame).mean()) for each in own)
+    near = abs(late - known.late_frames) <= max(1.0, 0.25 * abs(known.late_frames))
+    return known.kind == "clock" and bool(own) and near
+
+
 def is_by_chance(change: CameraChange) -> bool:
     """Return whether a change is more than a knock: people who agree nowhere seem to show it."""
     return abs(change.zoom) > 0.1 or abs(change.roll_rad) > np.radians(10.0)
 
 
-def join_changes(first: CameraChange, then: CameraChange) -> CameraChange:
-    """Return a change of a view with the little that was found after its correction."""
-    x, y, zoom, roll = (_view_amount(first) + _view_amount(then)).tolist()
-    return then.model_copy(update={"shift_px": (x, y), "zoom": zoom, "roll_rad": roll})
+def join_changes(camera: Camera, first: CameraChange, then: CameraChange) -> CameraChange:
+    """Return a change of a view with the little that was found after its correction.
+
+    Turns do not add up: after one of two degrees, a roll of one degree moves the view by another
+    0.3 mrad.
+    """
+    motions = [_view_motion(camera, _view_amount(each)) for each in (first, then)]
+    motion = motions[0] @ motions[1]
+    motion /= np.linalg.norm(motion[2])
+    grown = float(np.linalg.norm(motion[:2], axis=1).mean())
+    turn = Rotation.from_matrix(motion / [[grown], [grown], [1.0]]).as_rotvec()
+    amount = np.array([turn[1], -turn[0], grown - 1.0, turn[2]])
+    amount[:2] *= camera.focal
+    # A zoom after a turn is no turn after a zoom: the middle of the image counts.
+    wanted, turned = (each[:2, 2] / each[2, 2] for each in (motion, _view_motion(camera, amount)))
+    x, y = (amount[:2] + camera.focal * (wanted - turned) / grown).tolist()
+    found = {"shift_px": (x, y), "zoom": grown - 1.0, "roll_rad": float(turn[2])}
+    return then.model_copy(update=found)
 
 
 def _view_amount(change: CameraChange) -> Floats:

@@ -12,7 +12,16 @@ from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import HEALTH_MEASURES, CameraChange
 from worldpose.camera_consistency.health import CameraHealth, judge_health, measure_health
 from worldpose.geometry.cameras import Camera
-from worldpose.triangulation.camera_changes import correct_views, find_changes, sum_clip
+from worldpose.triangulation.camera_changes import (
+    change_record,
+    correct_views,
+    explains_clock,
+    find_changes,
+    join_changes,
+    move_on,
+    refine_change,
+    sum_clip,
+)
 from worldpose.triangulation.change_parts import Part, fit_parts
 from worldpose.triangulation.change_sums import ChangeSums
 from worldpose.triangulation.clock_courses import (
@@ -332,6 +341,38 @@ def test_a_known_change_is_taken_back_within_its_clip(change, moved):
     shift = corrected - pixels
     np.testing.assert_allclose(shift[:, 1, 0, 0, 0], -np.array(moved), atol=1e-5)
     assert not shift[:, 0].any()
+
+
+def test_what_people_show_of_a_slow_change_is_that_of_the_whole_clip(cameras):
+    update = {"camera": "a", "frame": None, "first_frame": 0, "frame_count": FRAMES}
+    known = KNOCK.model_copy(update=update | {"shift_px": (0.0, 12.0)})
+    people = view(cameras, sink)
+    pixels = np.array(people.keypoints)
+    own = pixels[:, [BAD]]
+    pixels[:, [BAD]] = correct_views(own, people.frame, {"a": cameras[BAD]}, [known])
+    found = refine_change(cameras, replace(people, keypoints=pixels), FPS, BAD, known)
+    assert found.frame is None
+    np.testing.assert_allclose(found.shift_px, [0.0, 20.0], atol=0.6)
+
+
+def test_a_far_knock_and_what_its_correction_leaves_are_one_motion():
+    far = KNOCK.model_copy(update={"frame": 10, "shift_px": (60.0, -50.0)})
+    rest = far.model_copy(update={"shift_px": (2.0, 1.0), "zoom": -0.003, "roll_rad": 0.02})
+    corner = [50.0, 60.0]
+    pixels = np.array([[CENTER, corner, 2.0 * CENTER - corner]])
+    both = move_on(pixels, np.array([12]), CAMERA, [far, rest])
+    joined = move_on(pixels, np.array([12]), CAMERA, [join_changes(CAMERA, far, rest)])
+    np.testing.assert_allclose(joined, both, atol=0.1)
+
+
+@pytest.mark.parametrize(("late", "is_explained"), [(3.5, True), (-3.5, False), (9.0, False)])
+def test_a_drift_explains_a_step_that_the_tracker_tells(cameras, late, is_explained):
+    (found,) = explain(cameras, view(cameras, fast))
+    drift = change_record(found, "b", np.arange(FRAMES))
+    told = drift.model_copy(update={"frame": 180, "late_frames": late})
+    assert explains_clock([drift], told) == is_explained
+    assert not explains_clock([drift], told.model_copy(update={"camera": "a"}))
+    assert not explains_clock([KNOCK], told)
 
 
 def test_cameras_that_all_sway_agree_with_nobody(cameras):
