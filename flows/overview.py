@@ -13,11 +13,13 @@ import os
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
+from threading import Thread
 from typing import Any, Final
 
 from pydantic import JsonValue
@@ -62,18 +64,59 @@ TURN_SHARE: Final = 0.2
 """Share of the time of a look after which it reads only matches that changed in the project."""
 MOST_FILES: Final = 1000
 """Files of a match that are watched one by one; of more, such as images, the folders."""
+SILENT_SECONDS: Final = 10.0
+"""After so long, a match whose disk has not answered is shown as it was kept."""
+SHORT_SECONDS: Final = 1.0
+"""The same while another match waits for its disk: many can be on one that does not answer."""
 BODIES = "body_fitting"
 """The stage whose bodies count as the poses of a project."""
 
 
 def read_summary(store: Store, match_id: str) -> MatchSummary:
-    """Return the summary of a match; made again unless the kept one is of what is there now."""
+    """Return the summary of a match; made again unless the kept one is of what is there now.
+
+    If a disk does not answer, it is silent: the kept one, with this problem.
+    """
+    place, known = (store.url, match_id), [MatchSummary(match_id=match_id)]
+    read: Future[MatchSummary] = Future()
+
+    def wait_for_disk() -> None:
+        try:
+            read.set_result(_read_summary(store, match_id, known))
+        except Exception as error:
+            read.set_exception(error)
+
+    late = {key: it for key, it in dict(_LATE).items() if it[0].is_alive()}
+    reader, known = late.get(place, (Thread(target=wait_for_disk, daemon=True), known))
+    if place not in late:
+        reader.start()
+        reader.join(SHORT_SECONDS if late else SILENT_SECONDS)
+        if not reader.is_alive():
+            return read.result()
+        _LATE[place] = reader, known
+    error = InputError(
+        f"match {match_id}",
+        expected="a disk of its folder that answers",
+        found=f"no answer yet after {SILENT_SECONDS:g} s",
+        todo="Look after the disk, or the network to it: what waits for it then goes on.",
+    )
+    return _say_problem(known[-1], error).model_copy(update={"is_silent": True})
+
+
+_LATE: Final[dict[tuple[str, str], tuple[Thread, list[MatchSummary]]]] = {}
+"""The threads that wait for the disks of matches, and what is known of these, by project."""
+
+
+def _read_summary(store: Store, match_id: str, known: list[MatchSummary]) -> MatchSummary:
+    """Return a summary as `read_summary`; the kept one is added to `known` before it is checked."""
     path = summary_path(match_id)
     with suppress(StoreError, InputError):  # it is damaged, or of another version
         data = store.blobs.read(path)
         kept = None if data is None else unseal(MatchSummary, data, path)
-        if kept and kept.match_id == match_id and kept.made_from == _basis(store, kept)[0]:
-            return kept
+        if kept and kept.match_id == match_id:
+            known.append(kept)
+            if kept.made_from == _basis(store, kept)[0]:
+                return kept
     return make_summary(store, match_id)
 
 

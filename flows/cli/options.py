@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+import subprocess
 from collections.abc import Callable, Mapping
 from copy import copy
 from inspect import Parameter
@@ -12,7 +13,7 @@ from typing import Annotated, Any, Final, get_args, get_origin, get_type_hints
 
 import typer
 
-from worldpose.errors import UsageError
+from worldpose.errors import InputError, UsageError
 
 
 def _require_rate(fps: float | None) -> float | None:
@@ -23,6 +24,8 @@ def _require_rate(fps: float | None) -> float | None:
 
 DEFAULT_PROJECT = "worldpose-data"
 PAGES_PORT = 8571
+DISK_SECONDS: Final = 30.0
+"""Time in which the disk of a project must answer a command."""
 
 
 def _shared(
@@ -131,6 +134,8 @@ def command_of(function: Callable[..., None]) -> Callable[..., None]:
         from flows.cli import console  # late: it imports pydantic
 
         console.output.quiet = as_json
+        if "project" in given:
+            require_answer(given["project"])
         if takes_store:
             from worldpose.store.store import LateStore
 
@@ -141,6 +146,30 @@ def command_of(function: Callable[..., None]) -> Callable[..., None]:
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     command.__name__, command.__doc__, command.__annotations__ = function.__name__, about, {}
     return command
+
+
+def require_answer(project: str) -> None:
+    """Refuse a project whose disk does not answer.
+
+    The process that asks the disk is left behind: no signal ends one that waits for it.
+
+    Raises:
+        InputError: there is no answer, not even that there is no project.
+    """
+    if "://" in project:
+        return
+    file = Path(project).expanduser() / "project.json"
+    nothing = subprocess.DEVNULL
+    asking = subprocess.Popen(["cat", file], stdin=nothing, stdout=nothing, stderr=nothing)
+    try:
+        asking.wait(DISK_SECONDS)
+    except subprocess.TimeoutExpired:
+        raise InputError(
+            str(file),
+            expected="a disk that answers",
+            found=f"no answer within {DISK_SECONDS:g} s",
+            todo="Look after the disk, or the network to it. Results are unchanged.",
+        ) from None
 
 
 def given_options(command: Callable[..., None], values: Mapping[str, object]) -> list[str]:

@@ -106,6 +106,9 @@ def adopt_due(runs: MatchRuns) -> None:
             except (InputError, ValueError) as error:  # as a parameter that is no JSON
                 runs.set_state(run["id"], "FAILED", f"it cannot be taken: {error}")
             continue
+        if ended.state == "failed" and run["state_type"] == "RUNNING":
+            runs.set_state(run["id"], "CRASHED", ended.message)  # else it would keep its place
+            continue
         is_retried = ended.state in ENDED and run["state_type"] == "SCHEDULED"
         if is_retried and parse_time(run["state"]["timestamp"]) > ended.changed_at:
             runs.queue.change(ended, "asked", "retried at Prefect")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
@@ -88,8 +89,8 @@ def beating(queue: RunQueue, run: QueuedRun, inputs: Path | None = None) -> Iter
                 number += 1
                 said = Heartbeat(number=number, share=share, doing=doing, at=datetime.now(UTC))
                 try:
-                    if inputs is not None and inputs.is_dir():
-                        list(inputs.iterdir())
+                    if inputs is not None:
+                        ask_disk(inputs)
                     queue.put_beat(run, said)
                 except Exception as error:  # as on a full disk: then there is no heartbeat
                     LOG.warning("%s: no heartbeat: %s", run.name, error)
@@ -104,6 +105,16 @@ def beating(queue: RunQueue, run: QueuedRun, inputs: Path | None = None) -> Iter
     finally:
         ended.set()
         writer.join(5.0)  # a last heartbeat must not follow the run's end; a disk can be frozen
+
+
+def ask_disk(folder: Path) -> None:
+    """Return when the disk of a match folder has answered; an error is an answer too."""
+    with suppress(OSError):
+        list(folder.iterdir())
+        with (folder / "match.yaml").open("rb", buffering=0) as file:
+            if hasattr(os, "posix_fadvise"):  # else memory may answer, as on macOS
+                os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+            file.read(1)
 
 
 def _describe(reporter: Reporter | None) -> tuple[float, str, int]:

@@ -8,10 +8,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
+from pathlib import Path
 from threading import Thread
 from typing import Final
 
-from flows.overview import Overview, is_late
+from flows.overview import SILENT_SECONDS, Overview, is_late
 from flows.service.alerts import Alert, AlertDispatcher, alerts_now
 from flows.service.channels import Channel, channels_of
 from flows.service.inbox import watch_once
@@ -19,6 +20,7 @@ from flows.service.match_runs import MatchRuns
 from flows.service.metrics import MAX_SCRAPES, ProjectMetrics, metrics_app
 from flows.service.plan import METRICS_TOKEN, ServePlan
 from flows.service.recovery import Liveness, recover
+from flows.service.run_queue import ask_disk
 from flows.web.http_server import serve_http
 from worldpose.store.run_queue import ENDED, queue_of
 from worldpose.store.store import Store
@@ -156,9 +158,25 @@ def _hold_alerts(
         arrivals = plan.state_folder.arrivals().values()
         found = alerts_now(plan, matches, arrivals, queue.runs())
         unread = {each.match_id for each in matches if each.is_unseen}
+        for each in matches:
+            if each.is_silent and (known := overview.store.registration(each.match_id)):
+                _ask_disk(Path(known.folder))
         dispatcher.hold([*found, *liveness.alerts], unread=unread)
 
     return hold
+
+
+def _ask_disk(folder: Path) -> None:
+    """Begin a step that ends when the disk of a silent match answers; a slow one does."""
+    what = f"looking at {folder}"
+
+    def ask() -> None:
+        ask_disk(folder)
+        STEPS.pop(what)
+
+    if what not in STEPS:
+        STEPS[what] = time.monotonic() - SILENT_SECONDS
+        Thread(target=ask, name=what, daemon=True).start()
 
 
 def _watch_steps(plan: ServePlan, dispatcher: AlertDispatcher) -> None:

@@ -166,6 +166,30 @@ def test_bytes_of_a_slow_disk_are_progress_until_it_stops(queue, monkeypatch, tm
     reader.join()
 
 
+def test_a_disk_that_lists_names_and_reads_nothing_ends_the_heartbeats(
+    queue, monkeypatch, tmp_path
+):
+    monkeypatch.setattr(run_queue, "BEAT_SECONDS", 0.05)
+    (tmp_path / "match").mkdir()
+    run, file = queue.begin(queue.take(a_run()), "m"), tmp_path / "match" / "match.yaml"
+
+    def beats_of_work():
+        before, end = queue.beat(run), time.monotonic() + 1.0
+        while time.monotonic() < end:
+            continue
+        return queue.beat(run).number - (before.number if before else 0)
+
+    with beating(queue, run, file.parent):  # without the file: that is an answer too
+        assert beats_of_work() > 1
+        os.mkfifo(file)
+        time.sleep(0.3)
+        assert beats_of_work() == 0
+        pipe = os.open(file, os.O_RDWR)
+        file.unlink()
+        os.close(pipe)
+        assert beats_of_work() > 1
+
+
 COMPUTE = """
 import sys, time
 from flows.service import run_queue, watching
