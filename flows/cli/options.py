@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import re
-import subprocess
 from collections.abc import Callable, Mapping
 from copy import copy
 from inspect import Parameter
@@ -24,8 +23,6 @@ def _require_rate(fps: float | None) -> float | None:
 
 DEFAULT_PROJECT = "worldpose-data"
 PAGES_PORT = 8571
-DISK_SECONDS: Final = 30.0
-"""Time in which the disk of a project must answer a command."""
 
 
 def _shared(
@@ -151,25 +148,19 @@ def command_of(function: Callable[..., None]) -> Callable[..., None]:
 def require_answer(project: str) -> None:
     """Refuse a project whose disk does not answer.
 
-    The process that asks the disk is left behind: no signal ends one that waits for it.
-
     Raises:
         InputError: there is no answer, not even that there is no project.
     """
-    if "://" in project:
-        return
+    from flows.service.layout import DISK_SECONDS, disk_answers  # late: it imports pydantic
+
     file = Path(project).expanduser() / "project.json"
-    nothing = subprocess.DEVNULL
-    asking = subprocess.Popen(["cat", file], stdin=nothing, stdout=nothing, stderr=nothing)
-    try:
-        asking.wait(DISK_SECONDS)
-    except subprocess.TimeoutExpired:
+    if "://" not in project and not disk_answers(file):
         raise InputError(
             str(file),
             expected="a disk that answers",
             found=f"no answer within {DISK_SECONDS:g} s",
             todo="Look after the disk, or the network to it. Results are unchanged.",
-        ) from None
+        )
 
 
 def given_options(command: Callable[..., None], values: Mapping[str, object]) -> list[str]:

@@ -79,7 +79,7 @@ def beating(queue: RunQueue, run: QueuedRun, inputs: Path | None = None) -> Iter
     waits for units, which have time limits of their own, the process and the disks of the store
     and of the folder `inputs` must answer.
     """
-    ended, clock = threading.Event(), _clock_of_this_thread()
+    ended, clock = threading.Event(), clock_of_this_thread()
 
     def write() -> None:
         before, number = (-1.0, -1), 0
@@ -129,7 +129,7 @@ def _describe(reporter: Reporter | None) -> tuple[float, str, int]:
     return min(max(at.share, 0.0), 1.0), doing, left
 
 
-def _clock_of_this_thread() -> Callable[[], float]:
+def clock_of_this_thread() -> Callable[[], float]:
     """Return a clock of the processor time of the calling thread [s], for other threads."""
     if hasattr(time, "pthread_getcpuclockid"):
         clock = time.pthread_getcpuclockid(threading.get_ident())

@@ -120,7 +120,7 @@ def test_a_silent_disk_of_a_match_is_an_alert_that_names_it(silent, two, monkeyp
     steps[what] -= 600.0
     watching._watch_steps(plan, dispatcher)
     (alert,) = kept_alerts(plan.state_folder).values()
-    assert f"{what}: no end in 10 min" in alert["text"]
+    assert f"{what}: no progress in 10 min" in alert["text"]
     silent()
     wait_until(lambda: not steps)
 

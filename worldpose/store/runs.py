@@ -11,10 +11,12 @@ import os
 import platform
 import re
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import IO
 
 from data_contracts.pin import Pin
 from data_contracts.run import Reservation
@@ -141,13 +143,17 @@ def hold_lock(file: Path, *, wait: bool) -> Iterator[bool]:
         file.parent.mkdir(exist_ok=True)
     is_of_other = file.exists() and not os.access(file, os.W_OK)  # another user's
     with file.open("r" if is_of_other else "a") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError:
-            is_held = False
-        else:
-            is_held = True
+        while not (is_held := _try_lock(lock)) and wait:
+            time.sleep(0.05)  # unlike one long wait, it shows that this process is well
         yield is_held
+
+
+def _try_lock(lock: IO[str]) -> bool:
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 LATEST = "latest"
