@@ -193,7 +193,8 @@ def _is_stuck(run: QueuedRun, there: PrefectRun | None, patience: timedelta) -> 
         return bool(due) and parse_time(due) > now + SOON
     pid = str(there["infrastructure_pid"] or "")
     has_process = pid.isdigit() and is_alive(int(pid))
-    return not has_process and parse_time(there["state"]["timestamp"]) < now - patience
+    # A clock that was set back makes the time one to come.
+    return not has_process and abs(now - parse_time(there["state"]["timestamp"])) > patience
 
 
 @dataclass

@@ -151,3 +151,9 @@ def test_a_command_says_that_the_disk_of_its_project_does_not_answer(
     with pytest.raises(InputError, match=r"project.json: .* no answer within 0.5 s"):
         options.command_of(command)(as_json=True, project=str(tmp_path), **more)
     os.close(os.open(file, os.O_RDWR))
+
+
+def test_no_lock_is_made_where_no_disk_is_mounted(state, tmp_path):
+    with pytest.raises(FileNotFoundError), state.only_one("versions", wait=True):
+        pass
+    assert list(tmp_path.iterdir()) == []

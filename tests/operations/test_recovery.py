@@ -279,17 +279,35 @@ def seal_beat(number):
 @pytest.mark.parametrize(("hours", "how"), [(-2, "back by 2.0 h"), (2, "forward by 2.0 h")])
 def test_a_step_of_the_clock_is_an_alert_for_a_day(queue, plan, hours, how):
     liveness = Liveness(plan)
+    run = queue.change(queue.take(a_run()), "begun", host="elsewhere", pid=1)
     for second in range(0, 3600, 60):  # a clock that is slewed by 500 ppm is well
+        queue.blobs.put("queue/match/m/id-m.beat.json", seal_beat(second))
         liveness.look(second, 1e9 + second * 1.0005)
     assert liveness.alerts == []
     wall = 1e9 + 3600.0 * hours
     liveness.look(3600.0, wall + 3600.0)
     (alert,) = liveness.alerts
     assert alert.alert == "clock_stepped" and how in alert.text
+    assert queue.latest(run).state == "begun"  # its progress has no time of the machine's clock
     liveness.look(3600.0 + 86399.0, wall + 3600.0 + 86399.0)
     assert liveness.alerts == [alert]
     liveness.look(3600.0 + 86401.0, wall + 3600.0 + 86401.0)
     assert liveness.alerts == []
+
+
+@pytest.mark.parametrize("hours", [-2, 2])
+def test_a_run_that_cannot_begin_is_found_whatever_became_of_the_clock(queue, hours):
+    run, now, step = queue.take(a_run()), datetime.now(UTC), timedelta(hours=hours)
+
+    def is_stuck(kind, *, due=None, since=now):
+        there = {"state_type": kind, "infrastructure_pid": None}
+        there |= {"next_scheduled_start_time": due and due.isoformat()}
+        there |= {"state": {"timestamp": since.isoformat()}}
+        return recovery._is_stuck(run, there, recovery.STARTING)
+
+    assert is_stuck("SCHEDULED", due=now + step) == (hours > 0)  # else the worker takes it now
+    assert is_stuck("PENDING", since=now + step)
+    assert not is_stuck("PENDING", since=now - timedelta(minutes=1))
 
 
 def test_a_step_of_the_watcher_that_does_not_end_is_an_alert(plan, monkeypatch):
