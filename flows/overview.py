@@ -13,13 +13,11 @@ import os
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
-from threading import Thread
 from typing import Any, Final
 
 from pydantic import JsonValue
@@ -32,6 +30,7 @@ from flows.gates import GATES
 from flows.layers import PROJECT, VENUES, layer_path, match_layer, read_layer, read_layers
 from flows.match_state import MatchState, describe_problem, match_state
 from flows.method import METHOD
+from flows.patience import SILENT_SECONDS, read_in_time
 from flows.registering import open_for_review
 from flows.results.timings import Cost
 from flows.review.corrections import objections_of
@@ -64,47 +63,32 @@ TURN_SHARE: Final = 0.2
 """Share of the time of a look after which it reads only matches that changed in the project."""
 MOST_FILES: Final = 1000
 """Files of a match that are watched one by one; of more, such as images, the folders."""
-SILENT_SECONDS: Final = 10.0
-"""After so long, a match whose disk has not answered is shown as it was kept."""
-SHORT_SECONDS: Final = 1.0
-"""The same while another match waits for its disk: many can be on one that does not answer."""
 BODIES = "body_fitting"
 """The stage whose bodies count as the poses of a project."""
 
 
-def read_summary(store: Store, match_id: str) -> MatchSummary:
+def read_summary(store: Store, match_id: str, *, is_patient: bool = True) -> MatchSummary:
     """Return the summary of a match; made again unless the kept one is of what is there now.
 
-    If a disk does not answer, it is silent: the kept one, with this problem.
+    If a disk does not answer, it is silent: the kept one, with this problem. While a disk is slow,
+    it is the kept one for who is not patient.
     """
-    place, known = (store.url, match_id), [MatchSummary(match_id=match_id)]
-    read: Future[MatchSummary] = Future()
-
-    def wait_for_disk() -> None:
-        try:
-            read.set_result(_read_summary(store, match_id, known))
-        except Exception as error:
-            read.set_exception(error)
-
-    late = {key: it for key, it in dict(_LATE).items() if it[0].is_alive()}
-    reader, known = late.get(place, (Thread(target=wait_for_disk, daemon=True), known))
-    if place not in late:
-        reader.start()
-        reader.join(SHORT_SECONDS if late else SILENT_SECONDS)
-        if not reader.is_alive():
-            return read.result()
-        _LATE[place] = reader, known
+    unseen = MatchSummary(match_id=match_id, is_unseen=True)
+    found, is_silent = read_in_time(
+        (store.url, match_id),
+        lambda known: _read_summary(store, match_id, known),
+        unseen,
+        is_patient=is_patient,
+    )
+    if not is_silent:
+        return found
     error = InputError(
         f"match {match_id}",
         expected="a disk of its folder that answers",
         found=f"no answer yet after {SILENT_SECONDS:g} s",
         todo="Look after the disk, or the network to it: what waits for it then goes on.",
     )
-    return _say_problem(known[-1], error).model_copy(update={"is_silent": True})
-
-
-_LATE: Final[dict[tuple[str, str], tuple[Thread, list[MatchSummary]]]] = {}
-"""The threads that wait for the disks of matches, and what is known of these, by project."""
+    return _say_problem(found, error).model_copy(update={"is_silent": True, "is_unseen": False})
 
 
 def _read_summary(store: Store, match_id: str, known: list[MatchSummary]) -> MatchSummary:
@@ -208,7 +192,7 @@ class Overview:
     def _read(self, name: str, mark: tuple[int, ...]) -> MatchSummary:
         self._at_work.add(name)
         try:
-            found = read_summary(self.store, name)
+            found = read_summary(self.store, name, is_patient=False)
         finally:
             self._at_work.discard(name)
         slim: dict[str, Any] = {"stages": {}, "units": {}, "watched": (), "settings": {}}

@@ -6,8 +6,7 @@ import logging
 import os
 import re
 import threading
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any, Final
 import psutil
 
 from data_contracts.operations import Heartbeat, QueuedRun
+from flows.patience import clock_of_this_thread
 from flows.progress import Reporter, format_duration
 from flows.service.layout import PRIORITIES
 from worldpose.formats.files import bytes_read
@@ -127,11 +127,3 @@ def _describe(reporter: Reporter | None) -> tuple[float, str, int]:
     if at.seconds_left is not None:
         doing += f", about {format_duration(at.seconds_left)}"
     return min(max(at.share, 0.0), 1.0), doing, left
-
-
-def clock_of_this_thread() -> Callable[[], float]:
-    """Return a clock of the processor time of the calling thread [s], for other threads."""
-    if hasattr(time, "pthread_getcpuclockid"):
-        clock = time.pthread_getcpuclockid(threading.get_ident())
-        return lambda: time.clock_gettime(clock)
-    return time.process_time  # macOS: of all threads

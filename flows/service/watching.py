@@ -12,7 +12,8 @@ from pathlib import Path
 from threading import Thread
 from typing import Final
 
-from flows.overview import SILENT_SECONDS, Overview, is_late
+from flows.overview import Overview, is_late
+from flows.patience import SILENT_SECONDS, clock_of_this_thread
 from flows.service.alerts import Alert, AlertDispatcher, alerts_now
 from flows.service.channels import Channel, channels_of
 from flows.service.inbox import watch_once
@@ -20,7 +21,7 @@ from flows.service.match_runs import MatchRuns
 from flows.service.metrics import MAX_SCRAPES, ProjectMetrics, metrics_app
 from flows.service.plan import METRICS_TOKEN, ServePlan
 from flows.service.recovery import Liveness, recover
-from flows.service.run_queue import ask_disk, clock_of_this_thread
+from flows.service.run_queue import ask_disk
 from flows.web.http_server import serve_http
 from worldpose.store.run_queue import ENDED, queue_of
 from worldpose.store.store import Store

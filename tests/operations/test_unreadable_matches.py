@@ -4,6 +4,7 @@ import errno
 import os
 import re
 import shutil
+import time
 from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
@@ -13,8 +14,8 @@ from command_line import worldpose
 from page_client import log_in, served
 from service import wait_until
 
-from flows import overview
-from flows.overview import Overview
+from flows import patience
+from flows.overview import Overview, read_summary
 from flows.registering import register
 from flows.service import watching
 from flows.service.alerts import AlertDispatcher, kept_alerts
@@ -66,7 +67,8 @@ def test_pages_show_the_others_beside_a_stale_mount(stale_mount):
 @pytest.fixture
 def silent(monkeypatch, two):
     """A function that lets the disk of the first match answer: before, no stat or read ends."""
-    monkeypatch.setattr(overview, "SILENT_SECONDS", 0.5)
+    monkeypatch.setattr(patience, "SILENT_SECONDS", 0.5)
+    monkeypatch.setattr(patience, "SHORT_SECONDS", 0.2)
     stat, answers, file = os.stat, Event(), two / "first" / "match.yaml"
     text = file.read_bytes()
     file.unlink()
@@ -102,6 +104,25 @@ def test_requests_that_wait_for_a_silent_disk_leave_the_pages_to_others(silent, 
     silent()
     wait_until(lambda: browser.get("/api/matches/first").status_code == 200)
     assert browser.get("/api/matches").json()["matches"][0]["problem"] is None
+
+
+@pytest.mark.timeout(120)
+def test_a_slow_disk_of_a_match_is_not_called_silent(two, monkeypatch):
+    monkeypatch.setattr(patience, "SILENT_SECONDS", 0.3)
+    monkeypatch.setattr(patience, "SHORT_SECONDS", 0.3)
+    store, stat = Store.open(two / "project"), os.stat
+    kept = read_summary(store, "first")
+
+    def wait(path, *arguments, **keywords):
+        if isinstance(path, str | os.PathLike) and os.fspath(path).startswith(str(two / "first")):
+            time.sleep(0.1)
+        return stat(path, *arguments, **keywords)
+
+    monkeypatch.setattr(os, "stat", wait)
+    seen = Overview(store)
+    for _ in range(3):
+        assert seen.read("first") == kept
+    assert read_summary(store, "first") == kept  # after the last answer
 
 
 @pytest.mark.timeout(120)
