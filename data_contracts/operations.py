@@ -189,6 +189,8 @@ class MatchSummary(Record):
     """Files and folders that it was made from: of the project, or absolute."""
     is_unseen: bool = False
     """Whether it was not made or verified yet; never stored."""
+    is_silent: bool = False
+    """Whether a disk did not answer in time; never stored."""
     problem: str = ""
     """Why the match cannot be opened."""
     kind: str = ""

@@ -30,6 +30,7 @@ from flows.gates import GATES
 from flows.layers import PROJECT, VENUES, layer_path, match_layer, read_layer, read_layers
 from flows.match_state import MatchState, describe_problem, match_state
 from flows.method import METHOD
+from flows.patience import SILENT_SECONDS, read_in_time
 from flows.registering import open_for_review
 from flows.results.timings import Cost
 from flows.review.corrections import objections_now
@@ -66,14 +67,40 @@ BODIES = "body_fitting"
 """The stage whose bodies count as the poses of a project."""
 
 
-def read_summary(store: Store, match_id: str) -> MatchSummary:
-    """Return the summary of a match; made again unless the kept one is of what is there now."""
+def read_summary(store: Store, match_id: str, *, is_patient: bool = True) -> MatchSummary:
+    """Return the summary of a match; made again unless the kept one is of what is there now.
+
+    If a disk does not answer, it is silent: the kept one, with this problem. While a disk is slow,
+    it is the kept one for who is not patient.
+    """
+    unseen = MatchSummary(match_id=match_id, is_unseen=True)
+    found, is_silent = read_in_time(
+        (store.url, match_id),
+        lambda known: _read_summary(store, match_id, known),
+        unseen,
+        is_patient=is_patient,
+    )
+    if not is_silent:
+        return found
+    error = InputError(
+        f"match {match_id}",
+        expected="a disk of its folder that answers",
+        found=f"no answer yet after {SILENT_SECONDS:g} s",
+        todo="Look after the disk, or the network to it: what waits for it then goes on.",
+    )
+    return _say_problem(found, error).model_copy(update={"is_silent": True, "is_unseen": False})
+
+
+def _read_summary(store: Store, match_id: str, known: list[MatchSummary]) -> MatchSummary:
+    """Return a summary as `read_summary`; the kept one is added to `known` before it is checked."""
     path = summary_path(match_id)
     with suppress(StoreError, InputError):  # it is damaged, or of another version
         data = store.blobs.read(path)
         kept = None if data is None else unseal(MatchSummary, data, path)
-        if kept and kept.match_id == match_id and kept.made_from == _basis(store, kept)[0]:
-            return kept
+        if kept and kept.match_id == match_id:
+            known.append(kept)
+            if kept.made_from == _basis(store, kept)[0]:
+                return kept
     return make_summary(store, match_id)
 
 
@@ -165,7 +192,7 @@ class Overview:
     def _read(self, name: str, mark: tuple[int, ...]) -> MatchSummary:
         self._at_work.add(name)
         try:
-            found = read_summary(self.store, name)
+            found = read_summary(self.store, name, is_patient=False)
         finally:
             self._at_work.discard(name)
         slim: dict[str, Any] = {"stages": {}, "units": {}, "watched": (), "settings": {}}

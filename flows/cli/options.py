@@ -12,7 +12,7 @@ from typing import Annotated, Any, Final, get_args, get_origin, get_type_hints
 
 import typer
 
-from worldpose.errors import UsageError
+from worldpose.errors import InputError, UsageError
 
 
 def _require_rate(fps: float | None) -> float | None:
@@ -131,6 +131,8 @@ def command_of(function: Callable[..., None]) -> Callable[..., None]:
         from flows.cli import console  # late: it imports pydantic
 
         console.output.quiet = as_json
+        if "project" in given:
+            require_answer(given["project"])
         if takes_store:
             from worldpose.store.store import LateStore
 
@@ -141,6 +143,24 @@ def command_of(function: Callable[..., None]) -> Callable[..., None]:
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     command.__name__, command.__doc__, command.__annotations__ = function.__name__, about, {}
     return command
+
+
+def require_answer(project: str) -> None:
+    """Refuse a project whose disk does not answer.
+
+    Raises:
+        InputError: there is no answer, not even that there is no project.
+    """
+    from flows.service.layout import DISK_SECONDS, disk_answers  # late: it imports pydantic
+
+    file = Path(project).expanduser() / "project.json"
+    if "://" not in project and not disk_answers(file):
+        raise InputError(
+            str(file),
+            expected="a disk that answers",
+            found=f"no answer within {DISK_SECONDS:g} s",
+            todo="Look after the disk, or the network to it. Results are unchanged.",
+        )
 
 
 def given_options(command: Callable[..., None], values: Mapping[str, object]) -> list[str]:

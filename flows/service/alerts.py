@@ -165,10 +165,7 @@ class AlertDispatcher:
                 if key in former or each.get("match") in unread
             }
             for alert in (each for held in self._held.values() for each in held):
-                known = before.get(alert.key)
-                if known is None:
-                    LOG.warning("alert: %s", alert.text)
-                kept = known or {"since": today, "told_by": []}
+                kept = before.get(alert.key) or {"since": today, "told_by": []}
                 told[alert.key] = {**kept, **_content(alert)}
             lasting = [each["text"] for each in told.values() if each["since"] < today]
             if lasting:
@@ -177,6 +174,9 @@ class AlertDispatcher:
                     digest.key, {**_content(digest), "since": today, "told_by": []}
                 )
             self._told = told
+            held_now = {alert.key for held in self._held.values() for alert in held}
+        for key in sorted(held_now - before.keys()):  # after all else: the log's disk can be frozen
+            LOG.warning("alert: %s", told[key]["text"])
         if told != before:
             self._keep()
 

@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 from typing import Final
 
 from data_contracts.operations import Arrival
-from flows.service.inbox import change_state, match_id_in, set_aside
+from flows.service.inbox import REMOVED, change_state, match_id_in
 from flows.service.layout import PRIORITIES, StateFolder
 from worldpose.errors import InputError, UsageError, WorldposeError
 from worldpose.formats.files import whole_file
@@ -161,7 +161,7 @@ class BucketInbox:
         )
 
     def _copy(self, name: str, objects: list[Entry]) -> None:
-        """Copy the whole match to the folder; an earlier copy is set aside."""
+        """Copy the whole match to the folder; the copy before is set aside, for that before it."""
         target = self.inbox / name
         draft = target.with_name(f".{target.name}.arriving")
         shutil.rmtree(draft, ignore_errors=True)
@@ -169,7 +169,10 @@ class BucketInbox:
             self._objects.download(each.path, draft / each.path.removeprefix(f"{name}/"))
         self._keep(name, [*self._copied.get(name, [""]), _fingerprint_files(draft)])
         if target.exists():
-            LOG.warning("%s: the copy before is now %s", target, set_aside(self.inbox, target))
+            before = self.inbox / REMOVED / "bucket" / name
+            shutil.rmtree(before, ignore_errors=True)
+            before.parent.mkdir(parents=True, exist_ok=True)
+            LOG.warning("%s: the copy before is now %s", target, target.rename(before))
         draft.rename(target)
 
     def _keep(self, name: str, fingerprints: list[str]) -> None:

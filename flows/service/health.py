@@ -14,7 +14,7 @@ from data_contracts.operations import Serving
 from flows.orchestration.prefect_api import PrefectApi, UnreachablePrefectError, parse_time
 from flows.orchestration.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN, problem_at
 from flows.service.alerts import STANDSTILLS, kept_alerts
-from flows.service.layout import StateFolder, is_alive
+from flows.service.layout import StateFolder, disk_answers, is_alive
 from flows.service.plan import FLOWS, deployment_name
 
 WORKER_SECONDS: Final = 90.0
@@ -121,6 +121,9 @@ def _check_progress(state: StateFolder) -> Iterator[Finding]:
 
 def _check_inbox(state: StateFolder, serving: Serving) -> Finding:
     inbox = Path(serving.inbox)
+    if not disk_answers(inbox):
+        remedy = f"Look after the disk of {inbox}, or the network to it."
+        return Finding("inbox", False, "its disk does not answer", remedy)
     if not os.access(inbox, os.R_OK | os.X_OK):
         remedy = f"Make the folder {inbox}, readable for this user."
         return Finding("inbox", False, "cannot be read", remedy)

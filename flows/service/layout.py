@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import os
+import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -23,6 +24,8 @@ from worldpose.store.runs import hold_lock
 
 PRIORITIES: Final[tuple[Priority, ...]] = ("urgent", "normal", "background")
 """First to last; `INBOX/urgent` and `INBOX/background` set the priority of their matches."""
+DISK_SECONDS: Final = 30.0
+"""Time in which the disk of a project or an inbox must answer a command."""
 
 
 @dataclass(frozen=True)
@@ -168,6 +171,20 @@ def served_state(url: str) -> StateFolder:
     if given is None and "://" in url:
         return StateFolder(Path("/nonexistent"))  # this machine serves no project
     return state_folder(url, None if given is None else Path(given))
+
+
+def disk_answers(path: Path) -> bool:
+    """Return whether the disk of a path answers in time; an error is an answer too.
+
+    The process that asks it is left behind: no signal ends one that waits for a disk.
+    """
+    nothing = subprocess.DEVNULL
+    asking = subprocess.Popen(["cat", path], stdin=nothing, stdout=nothing, stderr=nothing)
+    try:
+        asking.wait(DISK_SECONDS)
+    except subprocess.TimeoutExpired:
+        return False
+    return True
 
 
 def is_alive(pid: int) -> bool:

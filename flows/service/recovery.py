@@ -106,6 +106,9 @@ def adopt_due(runs: MatchRuns) -> None:
             except (InputError, ValueError) as error:  # as a parameter that is no JSON
                 runs.set_state(run["id"], "FAILED", f"it cannot be taken: {error}")
             continue
+        if ended.state == "failed" and run["state_type"] == "RUNNING":
+            runs.set_state(run["id"], "CRASHED", ended.message)  # else it would keep its place
+            continue
         is_retried = ended.state in ENDED and run["state_type"] == "SCHEDULED"
         if is_retried and parse_time(run["state"]["timestamp"]) > ended.changed_at:
             runs.queue.change(ended, "asked", "retried at Prefect")
@@ -190,7 +193,8 @@ def _is_stuck(run: QueuedRun, there: PrefectRun | None, patience: timedelta) -> 
         return bool(due) and parse_time(due) > now + SOON
     pid = str(there["infrastructure_pid"] or "")
     has_process = pid.isdigit() and is_alive(int(pid))
-    return not has_process and parse_time(there["state"]["timestamp"]) < now - patience
+    # A clock that was set back makes the time one to come.
+    return not has_process and abs(now - parse_time(there["state"]["timestamp"])) > patience
 
 
 @dataclass

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 import threading
-import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
@@ -15,6 +15,7 @@ from typing import Any, Final
 import psutil
 
 from data_contracts.operations import Heartbeat, QueuedRun
+from flows.patience import clock_of_this_thread
 from flows.progress import Reporter, format_duration
 from flows.service.layout import PRIORITIES
 from worldpose.formats.files import bytes_read
@@ -78,7 +79,7 @@ def beating(queue: RunQueue, run: QueuedRun, inputs: Path | None = None) -> Iter
     waits for units, which have time limits of their own, the process and the disks of the store
     and of the folder `inputs` must answer.
     """
-    ended, clock = threading.Event(), _clock_of_this_thread()
+    ended, clock = threading.Event(), clock_of_this_thread()
 
     def write() -> None:
         before, number = (-1.0, -1), 0
@@ -88,8 +89,8 @@ def beating(queue: RunQueue, run: QueuedRun, inputs: Path | None = None) -> Iter
                 number += 1
                 said = Heartbeat(number=number, share=share, doing=doing, at=datetime.now(UTC))
                 try:
-                    if inputs is not None and inputs.is_dir():
-                        list(inputs.iterdir())
+                    if inputs is not None:
+                        ask_disk(inputs)
                     queue.put_beat(run, said)
                 except Exception as error:  # as on a full disk: then there is no heartbeat
                     LOG.warning("%s: no heartbeat: %s", run.name, error)
@@ -106,6 +107,16 @@ def beating(queue: RunQueue, run: QueuedRun, inputs: Path | None = None) -> Iter
         writer.join(5.0)  # a last heartbeat must not follow the run's end; a disk can be frozen
 
 
+def ask_disk(folder: Path) -> None:
+    """Return when the disk of a match folder has answered; an error is an answer too."""
+    with suppress(OSError):
+        list(folder.iterdir())
+        with (folder / "match.yaml").open("rb", buffering=0) as file:
+            if hasattr(os, "posix_fadvise"):  # else memory may answer, as on macOS
+                os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+            file.read(1)
+
+
 def _describe(reporter: Reporter | None) -> tuple[float, str, int]:
     """Return the share of a run, what it does, and the units of its stage to be computed."""
     if reporter is None or not reporter.stage:
@@ -116,11 +127,3 @@ def _describe(reporter: Reporter | None) -> tuple[float, str, int]:
     if at.seconds_left is not None:
         doing += f", about {format_duration(at.seconds_left)}"
     return min(max(at.share, 0.0), 1.0), doing, left
-
-
-def _clock_of_this_thread() -> Callable[[], float]:
-    """Return a clock of the processor time of the calling thread [s], for other threads."""
-    if hasattr(time, "pthread_getcpuclockid"):
-        clock = time.pthread_getcpuclockid(threading.get_ident())
-        return lambda: time.clock_gettime(clock)
-    return time.process_time  # macOS: of all threads

@@ -130,7 +130,10 @@ class _Supervisor:
         return serving
 
     def end(self) -> None:
-        """End all parts in reverse order: runs end before the server that they report to."""
+        """End all parts in reverse order: runs end before the server that they report to.
+
+        A part that waits for a disk is left behind: it ends when the disk answers.
+        """
         for part in reversed(self.parts):
             process, part.process = part.process, None
             if process is None:
@@ -141,7 +144,10 @@ class _Supervisor:
                 process.wait(END_SECONDS)
             except subprocess.TimeoutExpired:
                 process.kill()
-                process.wait()
+                try:
+                    process.wait(END_SECONDS)
+                except subprocess.TimeoutExpired:
+                    self.tell(f"{part.name} ends when its disk answers: process {process.pid}")
 
     def _begin(self, part: _Part) -> None:
         part.log.parent.mkdir(parents=True, exist_ok=True)

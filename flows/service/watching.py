@@ -8,10 +8,12 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
+from pathlib import Path
 from threading import Thread
 from typing import Final
 
 from flows.overview import Overview, is_late
+from flows.patience import SILENT_SECONDS, clock_of_this_thread
 from flows.service.alerts import Alert, AlertDispatcher, alerts_now
 from flows.service.channels import Channel, channels_of
 from flows.service.inbox import watch_once
@@ -19,6 +21,7 @@ from flows.service.match_runs import MatchRuns
 from flows.service.metrics import MAX_SCRAPES, ProjectMetrics, metrics_app
 from flows.service.plan import METRICS_TOKEN, ServePlan
 from flows.service.recovery import Liveness, recover
+from flows.service.run_queue import ask_disk
 from flows.web.http_server import serve_http
 from worldpose.store.run_queue import ENDED, queue_of
 from worldpose.store.store import Store
@@ -47,6 +50,10 @@ BUCKET: Final = "looking at the bucket"
 """This step may last as long as it takes to copy matches."""
 STEPS: Final[dict[str, float]] = {}
 """Repeated steps that have begun and not ended, with their start [s]."""
+CLOCKS: Final[dict[str, Callable[[], float]]] = {}
+"""Processor time of the threads of steps [s]: it stands still while a disk does not answer."""
+_MOVED: Final[dict[str, tuple[float, float]]] = {}
+"""The last processor time of each step, and since when it is so [s]."""
 
 LOG = logging.getLogger("worldpose.operations")
 
@@ -123,6 +130,8 @@ def _start(what: str, seconds: float, step: Callable[[], object], rest: float = 
     trouble = Trouble(what)
 
     def repeat() -> None:
+        if hasattr(time, "pthread_getcpuclockid"):  # not macOS
+            CLOCKS[what] = clock_of_this_thread()
         while True:
             began = STEPS[what] = time.monotonic()
             with trouble.log_failure():
@@ -151,21 +160,41 @@ def _hold_alerts(
         Store.open(plan.project)  # if its disk is away, no alert is over
         end = time.monotonic() + READING_SECONDS
         while is_late(matches := overview.look(LOOK_SECONDS)) and time.monotonic() < end:
-            STEPS["looking for alerts"] = time.monotonic()  # it makes progress
             time.sleep(0.1)
         arrivals = plan.state_folder.arrivals().values()
         found = alerts_now(plan, matches, arrivals, queue.runs())
         unread = {each.match_id for each in matches if each.is_unseen}
+        for each in matches:
+            if each.is_silent and (known := overview.store.registration(each.match_id)):
+                _ask_disk(Path(known.folder))
         dispatcher.hold([*found, *liveness.alerts], unread=unread)
 
     return hold
 
 
+def _ask_disk(folder: Path) -> None:
+    """Begin a step that ends when the disk of a silent match answers; a slow one does."""
+    what = f"looking at {folder}"
+
+    def ask() -> None:
+        ask_disk(folder)
+        STEPS.pop(what)
+
+    if what not in STEPS:
+        STEPS[what] = time.monotonic() - SILENT_SECONDS
+        Thread(target=ask, name=what, daemon=True).start()
+
+
 def _watch_steps(plan: ServePlan, dispatcher: AlertDispatcher) -> None:
-    """Alert if a repeated step does not end: it needs no disk to notice that."""
-    now, limit = time.monotonic(), 60.0 * plan.stall_minutes
-    late = [what for what, at in list(STEPS.items()) if now - at > limit and what != BUCKET]
-    text = f"{', '.join(late)}: no end in {plan.stall_minutes:g} min; does a disk not answer?"
+    """Alert if a repeated step makes no progress: it needs no disk to notice that."""
+    now, limit, late = time.monotonic(), 60.0 * plan.stall_minutes, []
+    for what, began in list(STEPS.items()):
+        spent = CLOCKS[what]() if what in CLOCKS else 0.0
+        if spent != _MOVED.setdefault(what, (spent, 0.0))[0]:
+            _MOVED[what] = spent, now
+        if now - max(began, _MOVED[what][1]) > limit and what != BUCKET:
+            late.append(what)
+    text = f"{', '.join(late)}: no progress in {plan.stall_minutes:g} min; does a disk not answer?"
     alert = Alert("watch_stalled", "watch_stalled", text, f"{plan.pages}/status")
     dispatcher.hold([alert] if late else [], source="steps")
 

@@ -73,21 +73,32 @@ class PageContext:
             raise HTTPException(404, "no such match")
         return found
 
+    def _readable(self, name: str) -> str:
+        """Return the id of a registered match; many requests to a silent disk block all pages.
+
+        Raises:
+            HTTPException: as `registration`; 503, its disk does not answer.
+        """
+        match_id = self.registration(name).spec.match_id
+        if (now := self.overview.glance(match_id)).is_silent:
+            raise HTTPException(503, now.problem)
+        return match_id
+
     def match(self, name: str) -> Match:
         """Return a registered match with its current corrections.
 
         Raises:
-            HTTPException: as `registration`.
+            HTTPException: as `_readable`.
         """
-        return open_for_review(self.store, self.registration(name).spec.match_id)
+        return open_for_review(self.store, self._readable(name))
 
     def stored_match(self, name: str) -> Match:
         """Return a match to show its results, also while its folder is away.
 
         Raises:
-            HTTPException: as `registration`.
+            HTTPException: as `_readable`.
         """
-        return open_stored(self.store, self.registration(name).spec.match_id)
+        return open_stored(self.store, self._readable(name))
 
     def review(self, name: str, request: str) -> tuple[Match, ReviewRequest]:
         """Return a match and one of its review requests.

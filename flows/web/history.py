@@ -90,7 +90,7 @@ def _add_changes(router: APIRouter, context: PageContext) -> None:
 
     @router.post("/cancellation")
     def cancel(match_id: str) -> dict[str, bool]:
-        context.stored_match(match_id)
+        context.registration(match_id)  # its disk may not answer
         if not context.continuing.cancel(match_id):
             raise HTTPException(409, "no run of these pages is at work: end it where it was begun")
         return {"cancelled": True}

@@ -1,16 +1,18 @@
 """Each alert is sent once to every channel, to real servers."""
 
+import logging
 import os
 import socketserver
 from datetime import UTC, datetime, timedelta
 from email import message_from_bytes
-from threading import Thread
+from threading import Event, Thread
 from types import SimpleNamespace
 
 import apprise
 import pytest
 from command_line import worldpose
 from run_records import run_record
+from service import wait_until
 
 from data_contracts.operations import Arrival, MatchSummary, Question, QueuedRun
 from data_contracts.usability import Usability
@@ -360,6 +362,22 @@ def test_a_run_from_a_shell_ends_the_alert_about_a_failed_one(plan):
     assert alerts_now(plan, matches, [], [ended("m", "failed", "dark")]) == []
     before = [MatchSummary(match_id="m", latest=run_record(finished_at=NOW - timedelta(hours=1)))]
     assert len(alerts_now(plan, before, [], [ended("m", "failed", "dark")])) == 1
+
+
+def test_an_alert_is_sent_though_the_disk_of_the_log_does_not_answer(webhook, tmp_path):
+    answers, log = Event(), logging.Handler()
+    log.emit = lambda record: answers.wait(60.0)
+    watching.LOG.addHandler(log)
+    try:
+        dispatcher = AlertDispatcher(StateFolder(tmp_path), [hook(webhook)])
+        holding = Thread(target=dispatcher.hold, args=[many(1)])
+        holding.start()
+        wait_until(lambda: dispatcher.deliver(dispatcher.channels[0]) == 0.0 and webhook.posted)
+        assert not answers.is_set()
+    finally:
+        answers.set()
+        holding.join()
+        watching.LOG.removeHandler(log)
 
 
 def test_a_flood_of_alerts_is_one_message(webhook, tmp_path):

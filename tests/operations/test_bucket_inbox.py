@@ -78,8 +78,13 @@ def test_what_was_mended_in_the_bucket_takes_the_place_of_its_copy(arriving, tmp
     assert inbox.fetch(50.0, QUIET) == ["m"]
     assert (tmp_path / "inbox" / "m" / "match.yaml").read_bytes() == b"contract: 1\n"
     assert files_of(tmp_path / "inbox" / "m") == {"match.yaml"}
-    (aside,) = (tmp_path / "inbox" / ".removed").iterdir()
-    assert files_of(aside) == {"match.yaml", "old.npz"}
+    aside = tmp_path / "inbox" / ".removed"
+    assert files_of(aside) == {"bucket/m/match.yaml", "bucket/m/old.npz"}
+    put("m/match.yaml", b"contract: 20\n")
+    inbox.fetch(60.0, QUIET)
+    assert inbox.fetch(70.0, QUIET) == ["m"]
+    assert files_of(aside) == {"bucket/m/match.yaml"}  # the last copy before: disks are finite
+    assert (aside / "bucket" / "m" / "match.yaml").read_bytes() == b"contract: 1\n"
 
 
 def test_a_match_taken_in_loses_nothing_by_the_bucket(arriving, tmp_path, caplog):

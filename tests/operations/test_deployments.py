@@ -409,9 +409,11 @@ def test_a_run_that_a_person_retries_at_prefect_is_asked_for_again(lonely):
     _, prefect = lonely
     run = prefect.start("again")
     prefect.queue.change(run, "failed", "too dark")
-    prefect.set_state(run.flow_run, "FAILED", "")
-    adopt_due(prefect)
-    assert open_of(prefect, "again") == []
+    for given, kept in (("RUNNING", "CRASHED"), ("FAILED", "FAILED")):  # a place is not kept
+        prefect.set_state(run.flow_run, given, "")
+        adopt_due(prefect)
+        assert prefect.ask(f"/flow_runs/{run.flow_run}")["state_type"] == kept
+        assert open_of(prefect, "again") == []
     prefect.set_state(run.flow_run, "SCHEDULED", "", "AwaitingRetry")
     adopt_due(prefect)
     assert [each.id for each in open_of(prefect, "again")] == [run.id]

@@ -4,15 +4,19 @@ import os
 import socket
 from contextlib import ExitStack
 from datetime import UTC, datetime
+from types import SimpleNamespace
 
 import pytest
 from command_line import worldpose
 from service import free_ports
 
 from data_contracts.operations import Arrival, Service, Serving
+from flows.cli import options
+from flows.cli.project import status
+from flows.cli.serve import serve
 from flows.orchestration.prefect_environment import CLIENT_LOGIN
-from flows.service import health
-from flows.service.health import check
+from flows.service import health, layout
+from flows.service.health import _check_inbox, check
 from flows.service.layout import StateFolder
 from flows.service.match_runs import match_runs_of
 from flows.web.http_server import require_free_ports
@@ -132,3 +136,24 @@ def test_a_service_with_a_taken_port_starts_nothing(tmp_path, taken):
     assert (answer.code, answer.out) == (1, "")
     assert f"--metrics-port {taken}: expected a free port" in answer.err
     assert not list((tmp_path / "p").glob("operations/logs/*.log"))
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize(("command", "more"), [(serve, {"check": True}), (status, {"match": None})])
+def test_a_command_says_that_the_disk_of_its_project_does_not_answer(
+    command, more, monkeypatch, tmp_path
+):
+    monkeypatch.setattr(layout, "DISK_SECONDS", 0.5)
+    file = tmp_path / "project.json"
+    os.mkfifo(file)  # without a writer
+    silent = _check_inbox(StateFolder(tmp_path), SimpleNamespace(inbox=str(file)))
+    assert (silent.is_well, silent.state) == (False, "its disk does not answer")
+    with pytest.raises(InputError, match=r"project.json: .* no answer within 0.5 s"):
+        options.command_of(command)(as_json=True, project=str(tmp_path), **more)
+    os.close(os.open(file, os.O_RDWR))
+
+
+def test_no_lock_is_made_where_no_disk_is_mounted(state, tmp_path):
+    with pytest.raises(FileNotFoundError), state.only_one("versions", wait=True):
+        pass
+    assert list(tmp_path.iterdir()) == []

@@ -166,6 +166,30 @@ def test_bytes_of_a_slow_disk_are_progress_until_it_stops(queue, monkeypatch, tm
     reader.join()
 
 
+def test_a_disk_that_lists_names_and_reads_nothing_ends_the_heartbeats(
+    queue, monkeypatch, tmp_path
+):
+    monkeypatch.setattr(run_queue, "BEAT_SECONDS", 0.05)
+    (tmp_path / "match").mkdir()
+    run, file = queue.begin(queue.take(a_run()), "m"), tmp_path / "match" / "match.yaml"
+
+    def beats_of_work():
+        before, end = queue.beat(run), time.monotonic() + 1.0
+        while time.monotonic() < end:
+            continue
+        return queue.beat(run).number - (before.number if before else 0)
+
+    with beating(queue, run, file.parent):  # without the file: that is an answer too
+        assert beats_of_work() > 1
+        os.mkfifo(file)
+        time.sleep(0.3)
+        assert beats_of_work() == 0
+        pipe = os.open(file, os.O_RDWR)
+        file.unlink()
+        os.close(pipe)
+        assert beats_of_work() > 1
+
+
 COMPUTE = """
 import sys, time
 from flows.service import run_queue, watching
@@ -255,17 +279,35 @@ def seal_beat(number):
 @pytest.mark.parametrize(("hours", "how"), [(-2, "back by 2.0 h"), (2, "forward by 2.0 h")])
 def test_a_step_of_the_clock_is_an_alert_for_a_day(queue, plan, hours, how):
     liveness = Liveness(plan)
+    run = queue.change(queue.take(a_run()), "begun", host="elsewhere", pid=1)
     for second in range(0, 3600, 60):  # a clock that is slewed by 500 ppm is well
+        queue.blobs.put("queue/match/m/id-m.beat.json", seal_beat(second))
         liveness.look(second, 1e9 + second * 1.0005)
     assert liveness.alerts == []
     wall = 1e9 + 3600.0 * hours
     liveness.look(3600.0, wall + 3600.0)
     (alert,) = liveness.alerts
     assert alert.alert == "clock_stepped" and how in alert.text
+    assert queue.latest(run).state == "begun"  # its progress has no time of the machine's clock
     liveness.look(3600.0 + 86399.0, wall + 3600.0 + 86399.0)
     assert liveness.alerts == [alert]
     liveness.look(3600.0 + 86401.0, wall + 3600.0 + 86401.0)
     assert liveness.alerts == []
+
+
+@pytest.mark.parametrize("hours", [-2, 2])
+def test_a_run_that_cannot_begin_is_found_whatever_became_of_the_clock(queue, hours):
+    run, now, step = queue.take(a_run()), datetime.now(UTC), timedelta(hours=hours)
+
+    def is_stuck(kind, *, due=None, since=now):
+        there = {"state_type": kind, "infrastructure_pid": None}
+        there |= {"next_scheduled_start_time": due and due.isoformat()}
+        there |= {"state": {"timestamp": since.isoformat()}}
+        return recovery._is_stuck(run, there, recovery.STARTING)
+
+    assert is_stuck("SCHEDULED", due=now + step) == (hours > 0)  # else the worker takes it now
+    assert is_stuck("PENDING", since=now + step)
+    assert not is_stuck("PENDING", since=now - timedelta(minutes=1))
 
 
 def test_a_step_of_the_watcher_that_does_not_end_is_an_alert(plan, monkeypatch):
@@ -279,9 +321,11 @@ def test_a_step_of_the_watcher_that_does_not_end_is_an_alert(plan, monkeypatch):
     steps["looking at the inbox"] -= 20.0
     watching._watch_steps(plan, dispatcher)
     (alert,) = kept_alerts(plan.state_folder).values()
-    assert "looking at the inbox: no end in 10 min" in alert["text"]
-    del steps["looking at the inbox"]
-    watching._watch_steps(plan, dispatcher)
+    assert "looking at the inbox: no progress in 10 min" in alert["text"]
+    spent = iter(range(100))  # a slow disk: the thread goes on after each answer
+    monkeypatch.setattr(watching, "CLOCKS", {"looking at the inbox": lambda: next(spent)})
+    for _ in range(2):
+        watching._watch_steps(plan, dispatcher)
     assert kept_alerts(plan.state_folder) == {}
 
 

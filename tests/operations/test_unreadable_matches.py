@@ -4,14 +4,22 @@ import errno
 import os
 import re
 import shutil
+import time
 from pathlib import Path
+from threading import Event
+from types import SimpleNamespace
 
 import pytest
 from command_line import worldpose
 from page_client import log_in, served
+from service import wait_until
 
-from flows.overview import Overview
+from flows import patience
+from flows.overview import Overview, read_summary
 from flows.registering import register
+from flows.service import watching
+from flows.service.alerts import AlertDispatcher, kept_alerts
+from flows.service.plan import ServePlan
 from worldpose.store.store import Store
 
 
@@ -54,6 +62,88 @@ def test_pages_show_the_others_beside_a_stale_mount(stale_mount):
     assert (page.status_code, page.json()["problem"]) == (200, first["problem"])
     assert browser.get("/api/matches/second").status_code == 200
     assert browser.get("/status").status_code == 200
+
+
+@pytest.fixture
+def silent(monkeypatch, two):
+    """A function that lets the disk of the first match answer: before, no stat or read ends."""
+    monkeypatch.setattr(patience, "SILENT_SECONDS", 0.5)
+    monkeypatch.setattr(patience, "SHORT_SECONDS", 0.2)
+    stat, answers, file = os.stat, Event(), two / "first" / "match.yaml"
+    text = file.read_bytes()
+    file.unlink()
+    os.mkfifo(file)  # without a writer
+
+    def wait(path, *arguments, **keywords):
+        if isinstance(path, str | os.PathLike) and os.fspath(path).startswith(str(two / "first")):
+            answers.wait()
+        return stat(path, *arguments, **keywords)
+
+    def answer():
+        if not answers.is_set():
+            answers.set()
+            pipe = os.open(file, os.O_RDWR)
+            file.unlink()
+            file.write_bytes(text)
+            os.close(pipe)
+
+    monkeypatch.setattr(os, "stat", wait)
+    yield answer
+    answer()
+
+
+@pytest.mark.timeout(120)
+def test_requests_that_wait_for_a_silent_disk_leave_the_pages_to_others(silent, two):
+    browser = log_in(served(two / "project"), "Ada")
+    first, second = browser.get("/api/matches").json()["matches"]
+    assert "no answer yet" in first["problem"] and second["problem"] is None
+    for _ in range(50):  # more than the server has threads
+        assert "no answer yet" in browser.get("/status").text
+        assert browser.get("/api/matches/first").status_code == 503
+    assert browser.get("/api/matches/second").status_code == 200
+    silent()
+    wait_until(lambda: browser.get("/api/matches/first").status_code == 200)
+    assert browser.get("/api/matches").json()["matches"][0]["problem"] is None
+
+
+@pytest.mark.timeout(120)
+def test_a_slow_disk_of_a_match_is_not_called_silent(two, monkeypatch):
+    monkeypatch.setattr(patience, "SILENT_SECONDS", 0.3)
+    monkeypatch.setattr(patience, "SHORT_SECONDS", 0.3)
+    store, stat = Store.open(two / "project"), os.stat
+    kept = read_summary(store, "first")
+
+    def wait(path, *arguments, **keywords):
+        if isinstance(path, str | os.PathLike) and os.fspath(path).startswith(str(two / "first")):
+            time.sleep(0.1)
+        return stat(path, *arguments, **keywords)
+
+    monkeypatch.setattr(os, "stat", wait)
+    seen = Overview(store)
+    for _ in range(3):
+        assert seen.read("first") == kept
+    assert read_summary(store, "first") == kept  # after the last answer
+
+
+@pytest.mark.timeout(120)
+def test_a_silent_disk_of_a_match_is_an_alert_that_names_it(silent, two, monkeypatch):
+    steps, state = {}, two / "operations"
+    monkeypatch.setattr(watching, "STEPS", steps)
+    state.mkdir()
+    more = {"prefect": "http://127.0.0.1:9/api", "stall_minutes": 10, "disk_gb": 0.0}
+    plan = ServePlan(project=str(two / "project"), inbox=two, state=state, **more)
+    dispatcher, seen = AlertDispatcher(plan.state_folder, []), Overview(Store.open(two / "project"))
+    watching._hold_alerts(plan, seen, dispatcher, SimpleNamespace(alerts=[]))()
+    (what,) = steps
+    assert what == f"looking at {two / 'first'}"
+    watching._watch_steps(plan, dispatcher)
+    assert kept_alerts(plan.state_folder) == {}
+    steps[what] -= 600.0
+    watching._watch_steps(plan, dispatcher)
+    (alert,) = kept_alerts(plan.state_folder).values()
+    assert f"{what}: no progress in 10 min" in alert["text"]
+    silent()
+    wait_until(lambda: not steps)
 
 
 @pytest.mark.parametrize("record", ["runs/first/0001.json", "matches/first.json"])

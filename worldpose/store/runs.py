@@ -11,10 +11,12 @@ import os
 import platform
 import re
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import IO
 
 from data_contracts.pin import Pin
 from data_contracts.run import Reservation
@@ -113,9 +115,10 @@ def alone(blobs: Blobs, what: str, *, wait: bool) -> Iterator[bool]:
     of one user and machine do, by a lock in the folder of temporary files.
     """
     mine = Path(tempfile.gettempdir(), f"worldpose-{os.getuid()}")
+    places = [mine / hashlib.sha256(blobs.url.encode()).hexdigest()[:16]]
     with suppress(OSError):
         mine.mkdir(mode=0o700, exist_ok=True)
-    places = [mine / hashlib.sha256(blobs.url.encode()).hexdigest()[:16]]
+        places[0].mkdir(exist_ok=True)
     if "://" not in blobs.url:
         places.insert(0, Path(blobs.url, "locks"))
     with ExitStack() as stack:
@@ -134,18 +137,23 @@ def hold_lock(file: Path, *, wait: bool) -> Iterator[bool]:
     """Hold the lock of a file; yield whether it was acquired, which can fail without `wait`.
 
     The operating system releases the lock when the process ends, however it ends. The parent of the
-    lock's folder must exist.
+    lock's folder must exist, and not be empty: there a project's disk may not be mounted.
     """
-    file.parent.mkdir(exist_ok=True)  # not its parents: a project's disk may be away
+    if not file.parent.exists() and any(file.parent.parent.iterdir()):
+        file.parent.mkdir(exist_ok=True)
     is_of_other = file.exists() and not os.access(file, os.W_OK)  # another user's
     with file.open("r" if is_of_other else "a") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError:
-            is_held = False
-        else:
-            is_held = True
+        while not (is_held := _try_lock(lock)) and wait:
+            time.sleep(0.05)  # unlike one long wait, it shows that this process is well
         yield is_held
+
+
+def _try_lock(lock: IO[str]) -> bool:
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 LATEST = "latest"
