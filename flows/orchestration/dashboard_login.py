@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 from typing import Final
 from urllib.parse import quote
 
@@ -19,6 +20,10 @@ from flows.web.sessions import login_app
 
 FORM: Final = OPEN - {"/api/health"} | {"/api/session"}
 """Paths of the log-in form; Prefect's own `/login` would ask for its password."""
+BARE: Final = re.compile(
+    r"/api/(health|ready)|(/v2)?/(assets|fonts|ico)/.*|(/v2)?/[\w-]+\.(ico|js|svg|txt)"
+)
+"""Paths that Prefect answers without its login, to browsers too; others are pages."""
 CHECK_SECONDS: Final = 1.0
 """Interval at which the session of an open WebSocket is checked [s]."""
 
@@ -50,6 +55,7 @@ class DashboardLogin:
         headers, method = Headers(scope=scope), scope.get("method", "")
         is_own = "origin" in headers or headers.get("sec-fetch-site") == "same-origin"
         is_page = method == "GET" and "text/html" in headers.get("accept", "")
+        is_page = is_page and not BARE.fullmatch(scope["path"])
         who, role, _, _ = identify(self.access, scope, headers)
         if method and scope["path"] in self.form_paths:
             await self.form(scope, receive, send)

@@ -1,0 +1,41 @@
+"""The log-in in front of Prefect, before a stub that answers all requests alike."""
+
+import pytest
+from page_client import TOKEN, TestClient
+from starlette.responses import Response
+
+from flows.orchestration.dashboard_login import DashboardLogin
+from flows.web.access import access_for
+
+PORT = "http://127.0.0.1:4200"
+PAGE = {"accept": "text/html,application/xhtml+xml"}
+ROLES = {"Ada": "approver", "Vera": "viewer"}
+
+
+@pytest.fixture
+def access(tmp_path):
+    users = tmp_path / "users.toml"
+    entries = [f'[users.{who}]\nrole = "{ROLES[who]}"\ntoken = "{TOKEN}{who}"' for who in ROLES]
+    users.write_text("\n".join(entries))
+    users.chmod(0o600)
+    return access_for("127.0.0.1", token=TOKEN, names=(), secure=False, users=users)
+
+
+def browser(access, who=None, answer=None):
+    """A browser at Prefect's port, with the session of a person."""
+    answer = answer or Response("of Prefect")
+    cookies = None if who is None else {access.cookie: access.session(who)}
+    app = DashboardLogin(answer, access, "worldpose:login")
+    return TestClient(app, base_url=PORT, cookies=cookies, follow_redirects=False)
+
+
+@pytest.mark.parametrize("who", [None, "Vera", "Ada"])
+def test_files_and_health_need_no_session_in_a_browser_either(access, who):
+    opened = browser(access, who)
+    files = ("/assets/index-1.js", "/v2/fonts/a.woff2", "/ico/favicon.svg", "/robots.txt")
+    for path in ("/api/health", "/api/ready", *files):
+        answer = opened.get(path, headers=PAGE)
+        assert (answer.status_code, answer.text) == (200, "of Prefect"), path
+    for path in ("/runs", "/work-pools/work-pool/a.js", "/api/healthy", "/api/docs"):
+        status = {None: 303, "Vera": 403, "Ada": 200}[who]
+        assert opened.get(path, headers=PAGE).status_code == status, path
