@@ -67,7 +67,8 @@ class DashboardLogin:
             refused = refusal(403, f"the role of {who}, {role}, does not allow this")
             await refused(scope, receive, send)
         else:
-            asked = quote(f"{scope['path']}?{scope['query_string'].decode('latin-1')}", safe="/")
+            query = scope["query_string"]
+            asked = quote(scope["raw_path"] + (b"?" + query if query else b""), safe="/")
             await RedirectResponse(f"/login?next={asked}", status_code=303)(scope, receive, send)
 
     async def _ask(self, scope: Scope, receive: Receive, send: Send) -> None:

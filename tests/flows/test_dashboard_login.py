@@ -1,5 +1,7 @@
 """The log-in in front of Prefect, before a stub that answers all requests alike."""
 
+from urllib.parse import parse_qs, urlsplit
+
 import pytest
 from page_client import TOKEN, TestClient
 from starlette.responses import Response
@@ -39,3 +41,9 @@ def test_files_and_health_need_no_session_in_a_browser_either(access, who):
     for path in ("/runs", "/work-pools/work-pool/a.js", "/api/healthy", "/api/docs"):
         status = {None: 303, "Vera": 403, "Ada": 200}[who]
         assert opened.get(path, headers=PAGE).status_code == status, path
+
+
+@pytest.mark.parametrize("asked", ["/runs", "/runs/a%2Fb", "/x%3Fq?tab=a%26b&c", "/%ff", "/a%25b"])
+def test_the_form_leads_back_to_the_very_address(access, asked):
+    there = browser(access).get(asked, headers=PAGE).headers["location"]
+    assert parse_qs(urlsplit(there).query, errors="strict") == {"next": [asked]}
