@@ -73,19 +73,22 @@ class DashboardLogin:
 
     async def _ask(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on with the login; the dashboard's settings then name no login."""
-        is_settings = scope["path"] == "/ui-settings"
+        is_settings = (scope["method"], scope["path"]) == ("GET", "/ui-settings")
         dropped = (b"authorization", *[b"accept-encoding"] * is_settings)
         headers = [each for each in scope["headers"] if each[0] not in dropped]
         headers.append((b"authorization", authorization(self.login).encode()))
-        body = b""
+        status, body = 0, b""
 
-        async def collect(message: Message) -> None:
-            nonlocal body
-            body += message.get("body", b"")
+        async def answered(message: Message) -> None:
+            nonlocal status, body
+            status = message.get("status", status)
+            if not is_settings or status != 200:
+                await send(message)
+            else:
+                body += message.get("body", b"")
 
-        answered = collect if is_settings else send
         await self.app({**scope, "headers": headers}, receive, answered)
-        if is_settings:
+        if is_settings and status == 200:
             without = {**json.loads(body), "auth": None}  # the dashboard would ask for the login
             answer = JSONResponse(without, headers={"cache-control": "no-store"})
             await answer(scope, receive, send)

@@ -43,6 +43,19 @@ def test_files_and_health_need_no_session_in_a_browser_either(access, who):
         assert opened.get(path, headers=PAGE).status_code == status, path
 
 
+def test_of_the_dashboards_settings_only_a_good_answer_is_changed(access):
+    settings = b'{"auth": "BASIC", "flags": []}'
+    for method, status, said, expected in (
+        ("GET", 200, settings, b'{"auth":null,"flags":[]}'),
+        ("POST", 200, settings, settings),
+        ("GET", 503, settings, settings),
+        ("GET", 500, b"Internal Server Error", b"Internal Server Error"),
+    ):
+        ada = browser(access, "Ada", Response(said, status))
+        answer = ada.request(method, "/ui-settings", headers={"origin": PORT})
+        assert (answer.status_code, answer.content) == (status, expected), (method, status)
+
+
 @pytest.mark.parametrize("asked", ["/runs", "/runs/a%2Fb", "/x%3Fq?tab=a%26b&c", "/%ff", "/a%25b"])
 def test_the_form_leads_back_to_the_very_address(access, asked):
     there = browser(access).get(asked, headers=PAGE).headers["location"]
