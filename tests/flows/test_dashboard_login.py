@@ -43,6 +43,23 @@ def test_files_and_health_need_no_session_in_a_browser_either(access, who):
         assert opened.get(path, headers=PAGE).status_code == status, path
 
 
+def test_changes_at_prefect_are_logged_with_their_person(access, caplog):
+    caplog.set_level("INFO", "worldpose.pages")
+    ada = browser(access, "Ada", Response(status_code=202))
+    own = {"origin": PORT}
+    ada.delete("/api/deployments/1/filter", headers=own)
+    ada.post("/api/flow_runs/1/set_state%0A", headers=own)
+    ada.post("/api/work_pools/count-1/queues", headers=own)
+    for path in ("flow_runs/filter", "ui/task_runs/dashboard/counts", "events/count-by/day"):
+        ada.post(f"/api/{path}", headers=own)  # asked all the time by the dashboard
+    ada.get("/api/flows/1")
+    assert [record.getMessage() for record in caplog.records] == [
+        "Ada: 'DELETE /api/deployments/1/filter': 202",
+        "Ada: 'POST /api/flow_runs/1/set_state\\n': 202",
+        "Ada: 'POST /api/work_pools/count-1/queues': 202",
+    ]
+
+
 def test_of_the_dashboards_settings_only_a_good_answer_is_changed(access):
     settings = b'{"auth": "BASIC", "flags": []}'
     for method, status, said, expected in (
