@@ -18,7 +18,7 @@ from flows.web.guard import LOG, OPEN, SAFE, identify
 from flows.web.host_guard import SAFE_METHODS, refusal
 from flows.web.sessions import login_app
 
-FORM: Final = OPEN - {"/api/health"} | {"/api/session"}
+FORM: Final = OPEN - {"/api/health"} | {"/api/session", "/api/logout"}
 """Paths of the log-in form; Prefect's own `/login` would ask for its password."""
 BARE: Final = re.compile(
     r"/api/(health|ready)|(/v2)?/(assets|fonts|ico)/.*|(/v2)?/[\w-]+\.(ico|js|svg|txt)"
@@ -72,7 +72,8 @@ class DashboardLogin:
         elif not is_page or "authorization" in headers or not (who or self.form_paths):
             await self.app(scope, receive, send)
         elif who is not None:
-            refused = refusal(403, f"the role of {who}, {role}, does not allow this")
+            said = f"the role of {who}, {role}, does not allow this: others log in at /login"
+            refused = refusal(403, said)
             await refused(scope, receive, send)
         else:
             query = scope["query_string"]
