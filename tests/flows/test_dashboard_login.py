@@ -1,5 +1,9 @@
 """The log-in in front of Prefect, before a stub that answers all requests alike."""
 
+import json
+import shutil
+import subprocess
+from importlib.resources import files
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
@@ -95,3 +99,35 @@ def test_of_the_dashboards_settings_only_a_good_answer_is_changed(access):
 def test_the_form_leads_back_to_the_very_address(access, asked):
     there = browser(access).get(asked, headers=PAGE).headers["location"]
     assert parse_qs(urlsplit(there).query, errors="strict") == {"next": [asked]}
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no node")
+@pytest.mark.parametrize(
+    ("place", "status", "says_yes", "expected"),
+    [
+        ("", 200, True, ["/runs"]),  # goes on
+        ("", 401, True, []),  # the form stays
+        ("#out", 200, True, ["/api/logout s", "/login"]),
+        ("#out", 401, True, ["/api/logout s", "/login"]),
+        ("#out", 200, False, ["/runs"]),
+    ],
+)
+def test_the_form_goes_on_stays_or_asks_whether_to_log_out(place, status, says_yes, expected):
+    page = files("flows.web") / "login" / "page.js"
+    script = f"""
+      const seen = [], field = {{ focus() {{}}, addEventListener() {{}} }};
+      globalThis.document = {{ getElementById: () => field }};
+      globalThis.localStorage = {{ getItem: () => "" }};
+      globalThis.location = {{ hash: "{place}", search: "?next=%2Fruns" }};
+      location.replace = (to) => seen.push(to);
+      globalThis.confirm = () => {json.dumps(says_yes)};
+      globalThis.fetch = async (path, sent) => {{
+        if (sent) seen.push(`${{path}} ${{sent.headers["x-form-secret"]}}`);
+        const answer = sent ? {{ next: "/login" }} : {{ form_secret: "s" }};
+        return {{ ok: {status} === 200, json: async () => answer }};
+      }};
+      require({json.dumps(str(page))});
+      setTimeout(() => console.log(JSON.stringify(seen)), 50);
+    """
+    said = subprocess.run(["node", "-e", script], capture_output=True, text=True, check=True)
+    assert json.loads(said.stdout) == expected
