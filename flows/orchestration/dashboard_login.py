@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 from typing import Final
 from urllib.parse import quote
 
@@ -13,12 +14,21 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from flows.orchestration.prefect_environment import authorization
 from flows.web.access import Access
-from flows.web.guard import OPEN, identify
+from flows.web.guard import LOG, OPEN, SAFE, identify
 from flows.web.host_guard import SAFE_METHODS, refusal
 from flows.web.sessions import login_app
 
-FORM: Final = OPEN - {"/api/health"} | {"/api/session"}
+FORM: Final = OPEN - {"/api/health"} | {"/api/session", "/api/logout"}
 """Paths of the log-in form; Prefect's own `/login` would ask for its password."""
+BARE: Final = re.compile(
+    r"/api/(health|ready)|(/v2)?/(assets|fonts|ico)/.*|(/v2)?/[\w-]+\.(ico|js|svg|txt)"
+)
+"""Paths that Prefect answers without its login, to browsers too; others are pages."""
+READING: Final = re.compile(
+    r"POST .*/(filter|paginate|history|lateness|next-runs|validate|counts?|count-[\w-]+|"
+    r"events/count-by/[\w-]+)"
+)
+"""Requests that the dashboard makes all the time, and that change nothing."""
 CHECK_SECONDS: Final = 1.0
 """Interval at which the session of an open WebSocket is checked [s]."""
 
@@ -50,35 +60,51 @@ class DashboardLogin:
         headers, method = Headers(scope=scope), scope.get("method", "")
         is_own = "origin" in headers or headers.get("sec-fetch-site") == "same-origin"
         is_page = method == "GET" and "text/html" in headers.get("accept", "")
+        is_page = is_page and not BARE.fullmatch(scope["path"])
         who, role, _, _ = identify(self.access, scope, headers)
         if method and scope["path"] in self.form_paths:
             await self.form(scope, receive, send)
         elif who is not None and role == "approver" and (is_own or method in SAFE_METHODS):
-            await (self._ask if method else self._stream)(scope, receive, send)
+            if method:
+                await self._ask(who, scope, receive, send)
+            else:
+                await self._stream(scope, receive, send)
         elif not is_page or "authorization" in headers or not (who or self.form_paths):
             await self.app(scope, receive, send)
         elif who is not None:
-            refused = refusal(403, f"the role of {who}, {role}, does not allow this")
+            said = f"the role of {who}, {role}, does not allow this: others log in at /login"
+            refused = refusal(403, said)
             await refused(scope, receive, send)
         else:
-            asked = quote(f"{scope['path']}?{scope['query_string'].decode('latin-1')}", safe="/")
+            query = scope["query_string"]
+            asked = quote(scope["raw_path"] + (b"?" + query if query else b""), safe="/")
             await RedirectResponse(f"/login?next={asked}", status_code=303)(scope, receive, send)
 
-    async def _ask(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on with the login; the dashboard's settings then name no login."""
-        is_settings = scope["path"] == "/ui-settings"
+    async def _ask(self, who: str, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on with the login, and log each change with its person.
+
+        The dashboard's settings then name no login.
+        """
+        place = f"{scope['method']} {scope['path']}"
+        is_settings = place == "GET /ui-settings"
         dropped = (b"authorization", *[b"accept-encoding"] * is_settings)
         headers = [each for each in scope["headers"] if each[0] not in dropped]
         headers.append((b"authorization", authorization(self.login).encode()))
-        body = b""
+        status, body = 0, b""
 
-        async def collect(message: Message) -> None:
-            nonlocal body
-            body += message.get("body", b"")
+        async def answered(message: Message) -> None:
+            nonlocal status, body
+            status = message.get("status", status)
+            is_start = message["type"] == "http.response.start"
+            if is_start and scope["method"] not in SAFE and not READING.fullmatch(place):
+                LOG.info("%s: %r: %s", who, place, status)
+            if not is_settings or status != 200:
+                await send(message)
+            else:
+                body += message.get("body", b"")
 
-        answered = collect if is_settings else send
         await self.app({**scope, "headers": headers}, receive, answered)
-        if is_settings:
+        if is_settings and status == 200:
             without = {**json.loads(body), "auth": None}  # the dashboard would ask for the login
             answer = JSONResponse(without, headers={"cache-control": "no-store"})
             await answer(scope, receive, send)

@@ -45,11 +45,18 @@ class Login(Record):
 
 
 def login_app(access: Access) -> ASGIApp:
-    """Create the form alone, with what it asks for, as a part of another server."""
+    """Create the form alone, with what it asks for, as a part of a server for approvers."""
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None, redirect_slashes=False)
     app.exception_handler(RequestValidationError)(answer_malformed)
     app.include_router(login_routes(access))
-    app.add_api_route("/api/session", lambda: {}, methods=["GET"])
+
+    @app.get("/api/session")
+    def session(request: Request) -> JSONResponse:
+        secret = access.form_secret(request.state.session)
+        # Whom the other server refuses keeps the form, and can log out or in as another person.
+        status = 200 if request.state.role == "approver" else 401
+        return JSONResponse({"form_secret": secret}, status_code=status)
+
     return Guard(app, access)
 
 

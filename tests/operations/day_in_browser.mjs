@@ -193,7 +193,7 @@ async function schedule() {
   await page.waitForSelector(`text=${task.match}`);
   await shootSizes(page, seen, "status");
   await readHelp();
-  const prefect = await open({ errors: [], outside: seen.outside }, 900, page.context());
+  const prefect = await open({ errors: [], outside: seen.outside }, undefined, page.context());
   await prefect.goto(`${task.prefect}/deployments`);
   await prefect.getByRole("row").filter({ hasText: "reprocess" }).getByRole("link").first().click();
   await prefect.waitForURL(/deployment\/[-0-9a-f]+/);

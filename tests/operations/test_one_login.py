@@ -6,6 +6,7 @@ import time
 import urllib.request
 from http.cookiejar import CookieJar
 from urllib.parse import quote
+from uuid import uuid4
 
 import pytest
 from service import TOKEN, Served, fetch, request
@@ -155,5 +156,18 @@ def test_the_form_at_the_dashboard_opens_the_pages_too(served):
     assert request(prefect, "GET", "/api/session", ada)[0] == 200
     assert request(prefect, "GET", "/api/admin/version", ada)[0] == 200
     assert request(pages, "GET", "/api/matches", ada)[0] == 200
-    log = served.project / "operations" / "logs" / "prefect.log"
-    assert "Ada: 'POST /api/login': 200" in log.read_text()
+    for path in ("/api/health", "/api/ready"):
+        assert request(prefect, "GET", path, PAGE)[0] == 200
+    gone = f"/api/flow_runs/{uuid4()}"
+    own = {"origin": f"http://127.0.0.1:{prefect}"}
+    assert request(prefect, "DELETE", gone, {**ada, **own})[0] == 404
+    vera = log_in(prefect, "Vera")
+    status, _, session = request(prefect, "GET", "/api/session", vera)
+    assert status == 401
+    secret = {"x-form-secret": json.loads(session)["form_secret"]}
+    assert request(pages, "GET", "/api/session", vera)[0] == 200
+    assert request(prefect, "POST", "/api/logout", {**vera, **secret}, {})[0] == 200
+    assert request(pages, "GET", "/api/session", vera)[0] == 401
+    log = (served.project / "operations" / "logs" / "prefect.log").read_text()
+    for line in ("POST /api/login': 200", f"DELETE {gone}': 404"):
+        assert f"Ada: '{line}" in log

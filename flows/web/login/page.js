@@ -16,7 +16,15 @@ if (given) {
 field("who").value = localStorage.getItem("who") || "";
 (field("who").value ? field("token") : field("who")).focus();
 
-fetch("/api/session").then((answer) => { if (answer.ok) location.replace(next); });
+// Of a person who has logged in, #out asks whether to log out; a link alone must not do it.
+fetch("/api/session").then(async (answer) => {
+  const { form_secret: secret } = await answer.json();
+  if (secret && location.hash === "#out" && confirm("Log out?")) {
+    const headers = { "content-type": "application/json", "x-form-secret": secret };
+    const left = await fetch("/api/logout", { method: "POST", headers, body: "{}" });
+    location.replace((await left.json()).next);
+  } else if (answer.ok) location.replace(next);
+});
 
 form.addEventListener("submit", async (event) => {
   event.preventDefault();
