@@ -118,6 +118,9 @@ def test_rows_of_trc_are_at_their_frames_and_zeros_are_missing(tmp_path, numbers
     commas = "\n".join(line.replace(".", ",") for line in [*text[:2], "100.0\tm", *text[3:]])
     (tmp_path / "a.trc").write_text(commas + "\n")
     np.testing.assert_array_equal(read_markers(tmp_path / "a.trc").points, found.points)
+    (tmp_path / "a.trc").write_text("\n".join(text).replace("\t3", "\t3,000") + "\n")  # thousands
+    with pytest.raises(InputError, match="found could not convert string to float: '3,000'"):
+        read_markers(tmp_path / "a.trc")
     (tmp_path / "a.trc").write_text("\n".join([*text[:6], text[7], text[6].replace("0.0", "")]))
     with pytest.raises(InputError, match="that rise"):
         read_markers(tmp_path / "a.trc")
