@@ -182,16 +182,13 @@ def _read_trc(path: Path) -> tuple[float, tuple[str, ...], Floats, str, float]:
     about = dict(zip(lines[1].split("\t"), lines[2].split("\t"), strict=False))
     names = tuple(name for name in lines[3].split("\t")[2:] if name)
     width = 2 + 3 * len(names)
-    rows = [
-        [
-            float(decimal_point(cell.strip()) or "nan")
-            for cell in (line.split("\t") + [""] * width)[:width]
-        ]
-        for line in lines[5:]
-        if line.strip()
-    ]
+    cells = [(line.split("\t") + [""] * width)[:width] for line in lines[5:] if line.strip()]
+    # Commas beside points are of thousands, and refused.
+    has_points = any("." in cell for row in cells for cell in row)
+    number = str if has_points else decimal_point
+    rows = [[float(number(cell.strip()) or "nan") for cell in row] for row in cells]
     table = np.array(rows, dtype=np.float64).reshape(len(rows), width)
-    rate = float(decimal_point(about["DataRate"]))
+    rate = float(number(about["DataRate"]))
     place = _samples(path, table[:, 0], rate * table[:, 1])
     points = np.full((place[-1] + 1 if len(place) else 0, len(names), 3), np.nan)
     points[place] = table[:, 2:].reshape(len(rows), len(names), 3)

@@ -35,9 +35,9 @@ def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float
         rate = np.nan
         if "timestamp" in table:
             each = table.groupby(level=0).first()
-            time, most = each["timestamp"], 240.0  # if there are more, times are in minutes or so
-            if not pd.api.types.is_numeric_dtype(time):  # frames may be counted in milliseconds
-                time, most = pd.to_timedelta(time, errors="coerce").dt.total_seconds(), np.inf
+            time = each["timestamp"]
+            if is_text := not pd.api.types.is_numeric_dtype(time):
+                time = pd.to_timedelta(time, errors="coerce").dt.total_seconds()
             period = pd.factorize(each["period_id"])[0] if "period_id" in each else 0.0 * time
             rows = np.array([time.index, time, period], np.float64)
             # A clock may be coarser than a frame: only rows at which it moves on are exact.
@@ -45,9 +45,12 @@ def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float
             # Times begin again in each period, and perhaps later than the last one of before.
             steps = steps[:, (steps[1] > 0.0) & (steps[2] == 0.0)]
             rate = float(steps[0].sum() / steps[1].sum()) if steps.size else np.nan
-            while 0.0 < rate < 1.0:  # times are in ms or smaller units
-                rate *= 1000.0
-            rate = rate if rate <= most else np.nan
+            step = float(np.median(steps[1])) if steps.size else np.nan
+            while 0.0 < rate < 1.0 and not is_text:  # times are in ms or smaller units
+                rate, step = 1000.0 * rate, step / 1000.0
+            # Frames may be counted in milliseconds, but not 240 rows a second of a clock of 1 ms
+            # be exceeded: then times are in minutes or so.
+            rate = rate if rate >= 1.0 and step > 0.0039 else np.nan
         if {"person", "x", "y"} <= {*table}:
             named = "name" in table and table["name"].notna().all()
             who = table["name" if named else "person"]

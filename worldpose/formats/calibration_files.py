@@ -317,9 +317,11 @@ def plain_key(key: str) -> str:
 
 
 def tells_model(key: str) -> bool:
-    """Return whether an entry's name is one of a lens model, or contains such a word."""
+    """Return whether an entry's name is one of a lens model, or of what may name one."""
+    others = r"lens(name|type|projection)?|(is|use)?fisheye(lens)?|calib(ration)?model"
+    others += "|(model|projection)(name|type)|calib(ration)?type"
     plain = plain_key(key)
-    return plain in MODEL_NAMES or re.search("fisheye|lens|model|projection", plain) is not None
+    return plain in MODEL_NAMES or re.fullmatch(others, plain) is not None
 
 
 def read_model(where: str, given: Mapping[str, Any]) -> tuple[bool, bool]:
@@ -329,10 +331,10 @@ def read_model(where: str, given: Mapping[str, Any]) -> tuple[bool, bool]:
         InputError: one names another lens model than those of OpenCV, or two contradict.
     """
     # Names of lens models, and parts of them, which names of devices do not have.
-    lens_part = (
-        r"fish|omnidir|equidist|equisolid|kannala|spher|division|polynom|radial|ographic|lensmodel"
+    lens_part = r"fish|omnidir|equidist|equisolid|kannala|(?<!a)spher|division|polynom|radial"
+    lens_part += (
+        r"|ographic|lensmodel|^(pinhole_)?(omni|equi|e?ucm|fov|mei|poly\d*|ds|eq)(_none|_radtan)?$"
     )
-    lens_part += r"|^(pinhole_)?(omni|equi|e?ucm|fov|mei|poly\d*|ds|eq)(_none|_radtan)?$"
     said = {}
     for key in filter(tells_model, given):
         plain, values = plain_key(key), np.ravel(np.asarray(given[key], object))

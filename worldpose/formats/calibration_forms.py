@@ -113,13 +113,16 @@ def read_calibration(
     form, files = find_calibration(path) if path.is_dir() else _form_of(path)
     cameras = form.read(files, sizes, left_out)
     poses = {name: np.c_[one.rotation, one.translation] for name, one in cameras.items()}
-    at_zero = [name for name, pose in poses.items() if np.array_equal(pose, np.eye(3, 4))]
-    if len(at_zero) > 1:  # a single one may be that from which the others are counted
-        if left_out is None:
-            where = f"{path}: {', '.join(at_zero)}"
-            raise calibration_error(where, "poses", "rotation and translation that are all zero")
-        left_out.update(dict.fromkeys(at_zero, "it has no pose: rotation and translation are zero"))
-        cameras = {name: camera for name, camera in cameras.items() if name not in at_zero}
+    # No two cameras are at one place with one rotation; a single one may be at the origin.
+    lost = [
+        n for n, one in poses.items() if sum(np.array_equal(one, p) for p in poses.values()) > 1
+    ]
+    if lost:
+        names = ", ".join(lost)
+        if left_out is None or len(lost) == len(cameras):
+            raise calibration_error(f"{path}: {names}", "poses", "the same place and rotation")
+        left_out.update(dict.fromkeys(lost, f"it has no pose of its own, but one for {names}"))
+        cameras = {name: camera for name, camera in cameras.items() if name not in lost}
     if not any_unit:
         require_metres(path, cameras, form_unit_m(path))
     if left_out is not None:

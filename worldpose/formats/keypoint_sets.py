@@ -233,25 +233,31 @@ def order_by_points(where: str, points: AnyFloats, stated: str | None = None) ->
             return order
     pairs = np.array(list(_BONES.values()))
     misfits = [_misfit(order.select(points), pairs, _LENGTHS) for order in orders]
+    # Limbs that are hidden in all frames: a few others tell, of which a right order misses less.
+    few = [_misfit(order.select(points), pairs, _LENGTHS, 4) for order in orders]
+    are_few = bool(np.isnan(misfits).all())
+    compared = few if are_few else misfits
+    seen = [np.asarray((order.select(points)[..., 2] > 0.0).any(axis=0)) for order in orders]
+    # The border of an image hides both sides of people: an order that has one alone is another.
+    is_odd = [are_few and bool((each[1:17:2] != each[2:17:2]).any()) for each in seen]
     chosen = orders[0]
-    for order, misfit in zip(orders, misfits, strict=True):
+    for order, misfit, odd in zip(orders, compared, is_odd, strict=True):
         # An order that lacks the limbs, of NaN, explains nothing. Where the first one lacks them,
         # they may be hidden: there is no comparison, and the other has to fit well.
         most = plausible if np.isnan(misfits[0]) else wrong
-        if misfit <= most and not misfits[0] - misfit < _MARGIN:
+        is_better = not compared[0] - misfit < _MARGIN or (is_odd[0] and not odd)
+        if misfit <= most and is_better:
             chosen = order
-    # Limbs that are hidden in all frames: a few others tell, of which a right order misses less.
-    few = [_misfit(order.select(points), pairs, _LENGTHS, 4) for order in orders]
-    if np.isnan(misfits).all() and np.nanmin([*few, np.inf]) <= plausible:
-        chosen = orders[int(np.nanargmin(few))]
     if size == len(COCO17):
         human = (points, np.reshape(_HUMAN36M, (5, 2, 2)), _HUMAN36M_LENGTHS)
         other, by_few = _misfit(*human), _misfit(*human, 4)
         is_other = other <= plausible and not misfits[0] - other < _MARGIN
         if np.isnan(misfits[0]):
             is_other |= by_few <= plausible and few[0] - by_few > _MARGIN
-        seen: Flags = np.asarray((points[..., 2] > 0.0).any(axis=0))
-        if is_other or (seen[7:11].any() and not seen[5:7].any()):  # arms, but no shoulder
+        # Arms without shoulders are those of people who are cut at the chest, without a face.
+        is_cut = not seen[0][:5].any() and few[0] <= np.fmin(plausible, by_few)
+        is_armless = seen[0][7:11].any() and not seen[0][5:7].any()
+        if is_other or (is_armless and not is_cut):
             found = "thighs, shanks and arms as in the order of Human3.6M"
             todo = "Estimate poses with a model of COCO, or write COCO's joints."
             raise InputError(where, "the 17 joints in COCO's order", found, todo)

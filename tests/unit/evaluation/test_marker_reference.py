@@ -118,6 +118,9 @@ def test_rows_of_trc_are_at_their_frames_and_zeros_are_missing(tmp_path, numbers
     commas = "\n".join(line.replace(".", ",") for line in [*text[:2], "100.0\tm", *text[3:]])
     (tmp_path / "a.trc").write_text(commas + "\n")
     np.testing.assert_array_equal(read_markers(tmp_path / "a.trc").points, found.points)
+    (tmp_path / "a.trc").write_text("\n".join(text).replace("\t3", "\t3,000") + "\n")  # thousands
+    with pytest.raises(InputError, match="found could not convert string to float: '3,000'"):
+        read_markers(tmp_path / "a.trc")
     (tmp_path / "a.trc").write_text("\n".join([*text[:6], text[7], text[6].replace("0.0", "")]))
     with pytest.raises(InputError, match="that rise"):
         read_markers(tmp_path / "a.trc")
@@ -263,8 +266,10 @@ def test_places_at_another_rate_are_at_their_times(tmp_path, timed):
     [
         ([5, 6, 7, 900, 901], [0.1, 0.2, 0.3, 0.7, 0.8], ["1", "1", "1", "2", "2"], 10.0),
         ([7000, 7100, 7200], [0.0, 0.1, 0.2], ["1", "1", "1"], 1000.0),
+        ([7, 8, 9], [0.0, 0.0001, 0.0002], ["1", "1", "1"], np.nan),
+        ([7, 8, 9], [0.0, 3.0, 6.0], ["1", "1", "1"], np.nan),
     ],
-    ids=["periods", "milliseconds"],
+    ids=["periods", "milliseconds", "too short", "too long"],
 )
 def test_the_rate_is_that_within_periods_in_any_unit_of_frames(
     tmp_path, numbers, seconds, periods, rate
@@ -272,7 +277,7 @@ def test_the_rate_is_that_within_periods_in_any_unit_of_frames(
     rows = zip(periods, seconds, numbers, strict=True)
     lines = [f"{period},0 days 00:00:0{time:.6f},{n},3,4" for period, time, n in rows]
     (tmp_path / "a.csv").write_text("\n".join(["period_id,timestamp,frame_id,p_x,p_y", *lines]))
-    assert read_positions(tmp_path / "a.csv")[3] == pytest.approx(rate)
+    assert read_positions(tmp_path / "a.csv")[3] == pytest.approx(rate, nan_ok=True)
 
 
 def test_places_of_29_97_rows_a_second_without_times_stay_with_a_match_of_59_94(tmp_path):

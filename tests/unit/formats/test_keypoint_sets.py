@@ -124,13 +124,23 @@ def test_an_order_is_told_without_faces_and_of_people_seen_from_the_side(tmp_pat
 
 
 @pytest.mark.parametrize(
-    "hidden", ["knee|ankle", "elbow|wrist", "nose|eye|knee|ankle"], ids=["legs", "arms", "both"]
+    "hidden",
+    ["knee|ankle", "elbow|wrist", "nose|eye|knee|ankle", "nose|eye|ear|shoulder"],
+    ids=["legs", "arms", "both", "chest"],
 )
 @pytest.mark.parametrize(
-    ("names", "kind"), [(BODY25, "BODY_25"), (BODY_25B, "BODY_25B"), (HUMAN36M, "Human3.6M")]
+    ("names", "kind", "length"),
+    [
+        *[(COCO17, "COCO-17", 1.0), (BODY25, "BODY_25", 1.0), (BODY25, "BODY_25", 0.4)],
+        *[(BODY_25B, "BODY_25B", 1.0), (HUMAN36M, "Human3.6M", 1.0)],
+    ],
 )
-def test_an_order_is_told_where_limbs_are_hidden_in_all_frames(tmp_path, names, kind, hidden):
+def test_an_order_is_told_where_limbs_are_hidden_in_all_frames(
+    tmp_path, names, kind, length, hidden
+):
     person = np.reshape(points(names), (-1, 3))
+    knee, ankle = (names.index(f"left_{joint}") for joint in ("knee", "ankle"))
+    person[ankle, :2] += (1.0 - length) * (person[knee, :2] - person[ankle, :2])  # to the camera
     person[[re.search(hidden, name) is not None for name in names]] = 0.0
     file = tmp_path / "a.json"
     file.write_text(json.dumps([{"image_id": 0, "keypoints": person.ravel().tolist()}]))

@@ -470,10 +470,10 @@ def test_a_fisheye_is_known_by_every_usual_name(said, tmp_path):
     ("said", "model"),
     [
         ("projection: [[4, 0, 3, 0], [0, 4, 2, 0], [0, 0, 1, 0]]\nlens_model: Sigma 24mm", "brown"),
-        ("projection: rectilinear\ntype: RadialTangential\nmodel: Meike 25mm", "brown"),
-        ("distortion_model: radial_tangential\nmodel: GoPro HERO12 wide FOV", "brown"),
-        ("distortion_type: polynomial\nmodel: OmniVision OV9281\nlens_id: 1", "brown"),
-        ("fisheye: true\nmodel: opencv\ndistortion_model: none", "fisheye"),
+        ("projection: rectilinear\ntype: RadialTangential\nlens: 14mm Aspherical", "brown"),
+        ("distortion_model: radial_tangential\nmodel: HERO12 wide FOV\nfisheye_views: 1", "brown"),
+        ("distortion_type: polynomial\nmodel: OmniVision OV9281\nis_not_fisheye: true", "brown"),
+        ("fisheye: true\nmodel: opencv\ndistortion_model: none\nlens_note: radial", "fisheye"),
     ],
 )
 def test_devices_and_other_things_are_no_lens_models(said, model, tmp_path):

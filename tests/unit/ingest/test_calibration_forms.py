@@ -103,12 +103,7 @@ def test_a_camchain_counts_from_its_first_camera(tmp_path):
 
 def test_a_camchain_counts_by_the_numbers_of_its_cameras(tmp_path):
     lines = []
-    for name in (
-        "cam0",
-        "cam1",
-        *(f"cam{n}" for n in (10, 11)),
-        *(f"cam{n}" for n in range(2, 10)),
-    ):
+    for name in (f"cam{n}" for n in (0, 1, 10, 11, *range(2, 10))):
         lines += [f"{name}:", "  camera_model: pinhole", "  intrinsics: [900, 900, 639.5, 359.5]"]
         lines += ["  distortion_model: none", "  resolution: [1280, 720]"]
         if name != "cam0":
@@ -136,15 +131,25 @@ def test_cameras_of_panoptic_with_skew_pixels_or_without_a_pose_are_left_out(tmp
     assert "no pose" in left_out["c3"]
 
 
-def test_cameras_whose_poses_are_all_zero_have_none(tmp_path):
+@pytest.mark.parametrize("zeros", [(1, 2), (0, 2), (0,)], ids=["others", "reference", "alone"])
+@pytest.mark.parametrize("form", ["TOML", "Panoptic"])
+def test_cameras_of_one_pose_have_none(tmp_path, form, zeros):
     zero = {"rotation": tuple(map(tuple, np.eye(3).tolist())), "translation": (0.0,) * 3}
-    known = [rig()[0], *(one.model_copy(update=zero) for one in rig()[1:])]
-    write_calibration_toml(tmp_path / "c.toml", {one.id: one for one in known})
-    left_out = LeftOut()
-    assert list(read_calibration(tmp_path / "c.toml", left_out=left_out)) == ["a1"]
-    assert list(left_out) == ["b2", "c3"]
-    with pytest.raises(InputError, match=r"b2, c3: expected poses, found .* all zero"):
-        read_calibration(tmp_path / "c.toml")
+    known = [one.model_copy(update=zero if n in zeros else {}) for n, one in enumerate(rig())]
+    write_calibration_toml(path := tmp_path / "c.toml", {one.id: one for one in known})
+    if form == "Panoptic":
+        content = json.loads((path := WRITERS[form](tmp_path, known)).read_text())
+        for number in zeros:  # in the axes of the file
+            content["cameras"][number] |= {"R": np.eye(3).tolist(), "t": [0, 0, 0]}
+        path.write_text(json.dumps(content))
+    lost = [known[number].id for number in zeros if len(zeros) > 1]
+    found = read_calibration(path, left_out=(left_out := LeftOut()))
+    assert [*found] == [one.id for one in known if one.id not in lost]
+    assert [*left_out] == lost
+    if lost:
+        assert left_out[lost[0]].endswith(f"but one for {', '.join(lost)}")
+        with pytest.raises(InputError, match=rf"{', '.join(lost)}: expected poses, .* the same"):
+            read_calibration(path)
 
 
 @pytest.mark.parametrize(("unit", "metres"), [("mm", 1e-3), ("cm", 1e-2), ("m", 1.0)])

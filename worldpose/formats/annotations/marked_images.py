@@ -86,8 +86,7 @@ def read_marked_images(path: Path) -> list[MarkedImage]:
             raise ContentError(f"no JSON: {error}") from error
         if not any(image.points or image.lines for image in found):
             raise ContentError("no labelled point or line")
-        for image in found:
-            _require_pixels(image)
+        _require_pixels(found, per_cent=begin == b"[")
         return [image for image in found if image.points or image.lines or image.left_out]
 
     expected = "labelled points of CVAT (XML 1.1), Label Studio or COCO, or SoccerNet's lines"
@@ -95,15 +94,28 @@ def read_marked_images(path: Path) -> list[MarkedImage]:
     return decode_file(path, max_bytes, decode, expected, todo)
 
 
-def _require_pixels(image: MarkedImage) -> None:
-    """Raise ContentError if places are shares or pixels where the form has another unit."""
-    places = np.array([*(at for _, at in image.points), *(p for _, at in image.lines for p in at)])
-    if image.size is None or len(places) < 3:
-        return
-    share = (places + CORNER) / image.size
-    if (np.abs(share) <= 0.011).all() or (np.abs(share - 0.5) > 1.0).any(axis=1).mean() > 0.5:
-        found = f"{share.min():.3g} to {share.max():.3g} times the image's sides"
-        raise ContentError(f"{image.name}: places of {found}: in another unit?")
+def _require_pixels(found: list[MarkedImage], *, per_cent: bool) -> None:
+    """Raise ContentError if places are in another unit than the form's: per cent, or pixels."""
+    own, smallest = [np.empty((0, 2))], np.inf
+    for image in found:
+        places = np.array(
+            [*(at for _, at in image.points), *(p for _, at in image.lines for p in at)]
+        )
+        if image.size is None or not len(places):
+            continue
+        share = (places + CORNER) / image.size
+        if len(share) > 2 and (np.abs(share - 0.5) > 1.0).any(axis=1).mean() > 0.5:
+            found_share = f"{share.min():.3g} to {share.max():.3g} times the image's sides"
+            raise ContentError(f"{image.name}: places of {found_share}: in another unit?")
+        own.append(100.0 * share if per_cent else places + CORNER)
+        smallest = min(smallest, *image.size)
+    # Clicks of all images within the first pixel, or the first 100: few at a corner reach less far.
+    all_own = np.concatenate(own)
+    low, top = all_own.min(initial=np.inf), all_own.max(initial=-np.inf)
+    is_share = top <= (1.1 if per_cent else 1.1 + CORNER)
+    is_per_cent = not per_cent and smallest > 200 and 50.0 < top <= 110.0
+    if len(all_own) > 1 and low > -0.1 and (is_share or is_per_cent):
+        raise ContentError(f"places of {low:.3g} to {top:.3g} in all images: in another unit?")
 
 
 def _read_cvat(content: bytes) -> Iterator[MarkedImage]:

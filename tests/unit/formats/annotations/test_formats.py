@@ -208,5 +208,36 @@ def test_clicks_in_another_unit_than_per_cent_are_refused(tmp_path, unit):
         return tmp_path / "a.json"
 
     assert len(read_marked_images(write(1.0))[0].points) == 4
-    with pytest.raises(InputError, match=r"a\.png: places of .* times the image's sides"):
+    with pytest.raises(InputError, match=r"places of .* in another unit"):
         read_marked_images(write(unit))
+
+
+@pytest.mark.parametrize(
+    ("size", "places", "is_right"),
+    [
+        ((1920, 1080), [[(10, 20), (90, 30)], [(50, 80)]], False),
+        ((96, 54), [[(0.1, 0.2), (0.9, 0.3), (0.5, 0.8)]], False),
+        ((1920, 1080), [[(0.1, 0.2), (0.9, 0.3)], [(0.5, 0.8)]], False),
+        ((3840, 2160), [[(5, 5), (20, 10), (30, 20)]], True),
+        ((1920, 1080), [[(5, 5), (90, 10), (30, 80)], [(900, 500)]], True),
+    ],
+)
+def test_shares_and_per_cent_in_coco_are_refused_and_a_corner_is_not(
+    tmp_path, size, places, is_right
+):
+    images = [
+        {"id": n, "file_name": f"{n}.png", "width": size[0], "height": size[1]}
+        for n in range(len(places))
+    ]
+    clicks = [
+        {"image_id": n, "category_id": len(each), "keypoints": [v for at in each for v in (*at, 2)]}
+        for n, each in enumerate(places)
+    ]
+    names = [{"id": n, "name": "p", "keypoints": list("abc"[:n])} for n in (1, 2, 3)]
+    content = {"images": images, "annotations": clicks, "categories": names}
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    if is_right:
+        assert len(read_marked_images(tmp_path / "a.json")) == len(places)
+        return
+    with pytest.raises(InputError, match=r"places of .* in another unit"):
+        read_marked_images(tmp_path / "a.json")
