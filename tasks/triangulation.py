@@ -37,6 +37,7 @@ from worldpose.triangulation.camera_changes import (
     find_changes,
     is_by_chance,
     is_same_change,
+    join_changes,
 )
 from worldpose.triangulation.change_sums import ChangeSums, Kind, choose_bins, sum_joints
 from worldpose.triangulation.estimate import learn_clip, reconstruct_chunks
@@ -220,8 +221,12 @@ def _find_changes(
         change = change_record(measured, names[measured.camera], frame)
         if is_by_chance(change):  # told, not taken back
             change = change.model_copy(update={"is_explained": False})
-        if not any(is_same_change(one, change, clip.fps) for one in known):
+        same = [one for one in known if is_same_change(one, change, clip.fps)]
+        if not same:
             new.append(change)
+        elif change.frame is None:  # the tracker measured the drift on the people that it had left
+            joined = join_changes(clip.cameras[measured.camera], same[0], change)
+            known[known.index(same[0])] = joined
     known = [each for each in known if not explains_clock(new, each)]
     if not new and np.median(health.misfit) > 3.0:
         warnings.append(
@@ -231,8 +236,10 @@ def _find_changes(
         )
     warnings += [f"{describe_change(change)}." for change in new]
     clocks = [change for change in (*known, *new) if change.kind == "clock"]
+    clocks.sort(key=lambda each: abs(each.late_frames))  # the largest of a camera stays
     result.figures |= {CLOCK_CHANGE + each.camera: each.late_frames for each in clocks}
-    spoilt = sorted({each.camera for each in new if each.kind == "clock" or not each.is_explained})
+    unexplained = {each.camera for each in new if not each.is_explained}
+    spoilt = sorted(unexplained | {each.camera for each in clocks})
     if len(names) - len(spoilt) < 3 < len(names):
         warnings.append(f"changes of other cameras can hide behind those of {', '.join(spoilt)}.")
     return [*known, *new]

@@ -56,10 +56,8 @@ def clip_pictures(
     seen = placed_joints(run, clip)["inliers"].any("joint").sum("person").values
     if truth is not None:
         spec = match.folder.spec.clip(clip)
-        here = (truth.frames >= spec.first_frame) & (
-            truth.frames < spec.first_frame + spec.frame_count
-        )
-        truth = JointTracks(truth.frames[here], truth.person_ids, truth.joints[here])
+        own = (truth.frames - spec.first_frame) // spec.frame_count == 0
+        truth = JointTracks(truth.frames[own], truth.person_ids, truth.joints[own])
     pictures = []
     if len(tracks.frames):
         first = int(tracks.frames[0])

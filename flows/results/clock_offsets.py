@@ -72,7 +72,7 @@ class ClockOffsets(NamedTuple):
             return ""
         return (
             f"{len(apart)} groups of cameras share no person: {'; '.join(apart)}. Offsets are "
-            "relative to the first camera of each group; those between groups are unknown."
+            "relative to one camera of each group; those between groups are unknown."
         )
 
     @property

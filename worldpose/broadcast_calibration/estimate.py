@@ -380,8 +380,9 @@ def _keep_frames(clip: BroadcastClip, wanted: set[int], kept: dict[int, Image]) 
     Raises:
         InputError: people, boxes or camera data have other frames than the pictures.
     """
-    data = (clip.boxes, clip.people and clip.people.joints, clip.given and clip.given.values)
-    given = {len(rows) for rows in data if rows is not None}
+    given = set() if clip.boxes is None else {len(clip.boxes)}
+    given |= set() if clip.people is None else {len(clip.people.joints)}
+    given |= set() if clip.given is None else {len(clip.given.values)}
     count, pictures = 0, clip.pictures()
     for count, picture in enumerate(pictures, 1):
         if given and count > min(given):

@@ -413,11 +413,7 @@ def join_changes(camera: Camera, first: CameraChange, then: CameraChange) -> Cam
     motion /= np.linalg.norm(motion[2])
     grown = float(np.linalg.norm(motion[:2], axis=1).mean())
     turn = Rotation.from_matrix(motion / [[grown], [grown], [1.0]]).as_rotvec()
-    amount = np.array([turn[1], -turn[0], grown - 1.0, turn[2]])
-    amount[:2] *= camera.focal
-    # A zoom after a turn is no turn after a zoom: the middle of the image counts.
-    wanted, turned = (each[:2, 2] / each[2, 2] for each in (motion, _view_motion(camera, amount)))
-    x, y = (amount[:2] + camera.focal * (wanted - turned) / grown).tolist()
+    x, y = (camera.focal * [turn[1], -turn[0]]).tolist()
     found = {"shift_px": (x, y), "zoom": grown - 1.0, "roll_rad": float(turn[2])}
     return then.model_copy(update=found)
 

@@ -362,7 +362,8 @@ def test_a_far_knock_and_what_its_correction_leaves_are_one_motion():
     pixels = np.array([[CENTER, corner, 2.0 * CENTER - corner]])
     both = move_on(pixels, np.array([12]), CAMERA, [far, rest])
     joined = move_on(pixels, np.array([12]), CAMERA, [join_changes(CAMERA, far, rest)])
-    np.testing.assert_allclose(joined, both, atol=0.1)
+    # A zoom after a turn is no turn after a zoom: 0.003 of 78 px.
+    np.testing.assert_allclose(joined, both, atol=0.24)
 
 
 @pytest.mark.parametrize(("late", "is_explained"), [(3.5, True), (-3.5, False), (9.0, False)])
