@@ -229,7 +229,7 @@ def _read_people(
         seen[rows] = source.views
         tracks = replace(tracks, views=seen)
     around = None if truth else spec_around(folder)
-    tracks = tracks if around is None else metrics.count_views(tracks, around[1])
+    tracks = metrics.drop_views(tracks, around[1] if around else None)
     camera = wanted[0] if wanted else None
     return _People(folder, where, tracks, first, shipped, camera, tuple(used), plural)
 

@@ -263,9 +263,15 @@ def pool_people(
     )
 
 
-def count_views(reference: JointTracks, match: MatchSpec | None) -> JointTracks:
-    """Return true joints for scores: without `views` if the match has no static camera."""
-    dropped = match is not None and not match.static_cameras
+def drop_views(reference: JointTracks, match: MatchSpec | None) -> JointTracks:
+    """Return true joints for scores: without `views` if the match has no static camera.
+
+    Of an unknown match, views of at most one camera everywhere are a broadcast camera's.
+    """
+    if reference.views is None:
+        return reference
+    alone = match is None and reference.views.max(initial=0) <= 1
+    dropped = alone or (match is not None and not match.static_cameras)
     return replace(reference, views=None) if dropped else reference
 
 
@@ -392,9 +398,7 @@ def _counting_joints(reference: JointTracks, settings: EvaluationSettings) -> Fl
     exists = np.isfinite(reference.joints[..., 0])
     counts = exists
     if reference.views is not None:
-        seen = reference.views >= settings.min_views
-        # Nowhere enough: a broadcast camera's, which only tell what it shows.
-        counts = exists & seen if seen.any() else exists
+        counts = exists & (reference.views >= settings.min_views)
     enough = counts.sum(-1) >= settings.min_joint_share * exists.sum(-1)
     return np.asarray(counts & enough[..., None])
 

@@ -7,7 +7,7 @@ from camera_builders import look_at_camera
 
 from data_contracts.conventions import COCO17
 from flows.results.dataset import check, count, stated_rates
-from flows.results.evaluation import reference_side, score
+from flows.results.evaluation import score
 from worldpose.body.body_file import OPEN_BODY
 from worldpose.body.model import BodyParameters
 from worldpose.dataset.benchmark import score_folders
@@ -74,13 +74,14 @@ def test_people_whom_one_camera_saw_count_by_no_door_unless_the_match_has_none(t
     np.testing.assert_allclose(told(), [[1, 10.0]] * 2)
     write_match(tmp_path / "match", "broadcast")
     np.testing.assert_allclose(told(), [[2, 260.0]] * 2)
-    assert reference_side(str(reference)).joints.views is None  # which methods are scored against
     # Those of a broadcast camera alone, without a match that says so.
     (tmp_path / "match" / "match.yaml").unlink()
     for one in (0, 1):
         shown = JointTracks(frames, persons, joints, views=np.minimum(views, one))
         write_joints(reference / "joints.npz", shown)
         np.testing.assert_allclose(told(), [[2, 260.0]] * 2)
+    write_match(tmp_path / "match", "static")
+    assert told()[:, 0].tolist() == [0, 0]
 
 
 def test_a_clip_with_nobody_is_checked_counted_and_scored(tmp_path):
