@@ -275,6 +275,20 @@ def drop_views(reference: JointTracks, match: MatchSpec | None) -> JointTracks:
     return replace(reference, views=None) if dropped else reference
 
 
+def require_common(where: str, predicted: Integers, true: Integers) -> None:
+    """Raise InputError if both sides have match frames, and none in common."""
+    sides = predicted, true
+    if all(map(len, sides)) and not len(np.intersect1d(*sides)):
+        own, wanted = (f"{frames.min()} to {frames.max()}" for frames in sides)
+        raise InputError(
+            where,
+            expected=f"match frames of the reference, which has some of {wanted}",
+            found=f"{own}, none in common",
+            todo="Name the prediction of the same clip, number both sides by match frames, or "
+            "predict the labelled frames, with NaN where nobody was found.",
+        )
+
+
 def evaluate_joints(
     prediction: JointTracks,
     reference: JointTracks,
@@ -307,15 +321,7 @@ def evaluate_joints(
     settings = settings or EvaluationSettings()
     if fps is not None:
         row_rate("evaluate_joints", fps)
-    sides = prediction.frames, reference.frames
-    if all(map(len, sides)) and not len(np.intersect1d(*sides)):
-        own, wanted = (f"{frames.min()} to {frames.max()}" for frames in sides)
-        raise InputError(
-            "frames of the prediction",
-            expected=f"match frames of the reference, which has some of {wanted}",
-            found=f"{own}, none in common",
-            todo="Name the prediction of the same clip, or number both sides by match frames.",
-        )
+    require_common("frames of the prediction", prediction.frames, reference.frames)
     people = select_frames(prediction.joints, prediction.frames, reference.frames)
     distances = joint_distances(people, reference.joints)
     match = match_people(distances, settings.match_gate_m)
