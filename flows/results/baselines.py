@@ -17,7 +17,7 @@ from worldpose.body.body_file import OPEN_BODY, find_body
 from worldpose.errors import UsageError, unknown_name
 from worldpose.evaluation.challenge import ALL
 from worldpose.evaluation.matching import EvaluationSettings
-from worldpose.evaluation.metrics import evaluate_joints
+from worldpose.evaluation.metrics import drop_views, evaluate_joints
 from worldpose.formats.baselines import Method, find_method
 from worldpose.formats.baselines.result import MethodResult, resample_result
 from worldpose.formats.joints_file import JointTracks
@@ -63,7 +63,8 @@ def score_methods(
             todo="Name the folder that contains these files.",
         )
     camera = None if match_in is None else cameras[match_in]
-    frames = truth.joints.frames
+    true = drop_views(truth.joints, spec)
+    frames = true.frames
     first = first_frame if first_frame is not None else int(frames[0]) if len(frames) else 0
     model = find_body(body or OPEN_BODY)
     rate = fps or truth.fps
@@ -86,7 +87,7 @@ def score_methods(
             result.joints.frames + first, result.joints.person_ids, result.joints.joints
         )
         evaluation, _ = evaluate_joints(
-            joints, truth.joints, settings, fps=rate, camera=camera, boxes=_boxes(result, camera)
+            joints, true, settings, fps=rate, camera=camera, boxes=_boxes(result, camera)
         )
         scores.append(
             MethodScore(

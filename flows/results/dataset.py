@@ -34,9 +34,7 @@ def stated_rates(folder: Path, fps: float | None = None) -> dict[str, float | No
     Raises:
         InputError: a file cannot be read.
     """
-    clips, manifest = list_clips(folder), read_manifest(folder)
-    said = fps or (None if manifest is None else manifest.fps)
-    return {clip: said or stated_rate(folder, clip) for clip in clips}
+    return {clip: fps or stated_rate(folder, clip) for clip in list_clips(folder)}
 
 
 def check(

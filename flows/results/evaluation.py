@@ -25,7 +25,7 @@ from worldpose.evaluation.marker_reference import (
     read_marker_map,
     read_markers,
 )
-from worldpose.evaluation.metrics import PersonScore, count_views, evaluate_joints
+from worldpose.evaluation.metrics import PersonScore, drop_views, evaluate_joints
 from worldpose.evaluation.position_reference import align_positions
 from worldpose.formats.joints_file import JointTracks, read_joints
 from worldpose.formats.release_cameras import read_camera
@@ -124,8 +124,8 @@ def score(
         mine, tracks, notes = align_positions(Path(reference), estimate.joints, first, known)
         estimate, truth = replace(estimate, joints=mine), Side(tracks, {})
     spec = None if match is None else match.spec
-    if estimate.match is not None and truth.joints is not None:
-        truth = replace(truth, joints=count_views(truth.joints, estimate.match.spec))
+    if truth.joints is not None:
+        truth = replace(truth, joints=drop_views(truth.joints, spec))
     true_cameras = cameras_of(reference, truth, spec)
     if match_in is not None and match_in not in true_cameras:
         raise UsageError(
@@ -212,8 +212,6 @@ def reference_side(name: str) -> Side:
         cameras = {file.stem: read_camera(file) for file in files}
     else:
         joints, cameras = load_reference(name), {}
-    if joints is not None and around:
-        joints = count_views(joints, around[1])
     return Side(joints, cameras, match, fps=rate)
 
 

@@ -274,11 +274,12 @@ class _Clip:
             moved[person] = replace(own, place=new)
             known = np.isfinite(place[own.span, person, 0])
             place[own.span, person][known] = new[known]
-            # Across the line of sight the fitted place is no surer than the tracked one.
+            # Across the line of sight, or without an ankle, it is no surer than the tracked place.
             along = sight[..., :, None] * sight[..., None, :]
             across = np.eye(2) - along
             spread = across @ evidence.place_covariance[own.span, person] @ across
             spread = spread + variance[:, None, None] * along
+            known &= seen.any(axis=1)
             covariance[own.span, person][known] = spread[known]
         evidence = replace(evidence, place=place, place_covariance=covariance)
         return replace(self, evidence=evidence, lifted=_lift_keypoints(evidence)), moved

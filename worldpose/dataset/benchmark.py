@@ -199,6 +199,8 @@ def _read_people(
         expected = f"frames {first} to {first + count - 1} of the clip"
         todo = "Write one row for each frame of the clip, with NaN where no person was found."
         raise wrong(where, expected, f"{first + low} to {first + high}", todo)
+    if truth and source.frames is not None and truth.clip.sources[0].frames is not None:
+        metrics.require_common(where, source.frames, truth.clip.sources[0].frames)
     joints = np.full((count, source.points.shape[1], len(COCO17), 3), np.nan)
     for place, name in enumerate(COCO17):
         if name in source.skeleton:
@@ -224,12 +226,14 @@ def _read_people(
         read = ", ".join(f"{key} as {PLURALS[key]}" for key in keys)
         plural = {f"{poses}": f"read {read}, as public readers name it"} if keys else {}
     tracks = JointTracks(np.arange(count), np.arange(joints.shape[1]), joints)
-    if source.views is not None:
+    shape = joints[rows].shape[:3]  # poses tell no views, and joints of the same people may
+    views = [each.views for each in shipped.sources if each.views is not None]
+    if same := [each for each in views if each.shape == shape]:
         seen = np.zeros(joints.shape[:3], np.int64)
-        seen[rows] = source.views
+        seen[rows] = same[0]
         tracks = replace(tracks, views=seen)
     around = None if truth else spec_around(folder)
-    tracks = tracks if around is None else metrics.count_views(tracks, around[1])
+    tracks = metrics.drop_views(tracks, around[1] if around else None)
     camera = wanted[0] if wanted else None
     return _People(folder, where, tracks, first, shipped, camera, tuple(used), plural)
 
@@ -300,20 +304,27 @@ def _boxes(mine: _People, truth: _People, camera: Camera) -> Floats | None:
 
 def _describe_shift(where: str, found: Floats, true: Floats) -> dict[str, str]:
     """Return a note if a prediction fits the reference much better some frames earlier or later."""
-    errors = {}
+    errors = {}  # before and after; a short clip has frames that no shift but 0 compares
     reach = max(0, min(3, len(found) - 1))
     for late in range(-reach, reach + 1):
         mine = found[max(late, 0) : len(found) + min(late, 0)]
         theirs = true[max(-late, 0) : len(true) - max(late, 0)]
-        source, target = (metrics.paper_joints(each).reshape(-1, 3) for each in (mine, theirs))
-        away = align(source, target, with_scale=True).apply(source) - target
-        known = np.linalg.norm(away[np.isfinite(away).all(-1)], axis=-1)
-        errors[late] = float(known.mean()) if len(known) else np.inf
-    best = min(errors, key=lambda late: (errors[late], abs(late)))
-    if not errors[best] < LIMITS.max_share_left * errors[0]:
+        same = true[max(late, 0) : len(true) + min(late, 0)]
+        pair = []
+        for each in (same, theirs):
+            source, target = (metrics.paper_joints(side).reshape(-1, 3) for side in (mine, each))
+            away = align(source, target, with_scale=True).apply(source) - target
+            known = np.linalg.norm(away[np.isfinite(away).all(-1)], axis=-1)
+            pair.append(float(known.mean()) if len(known) else np.inf)
+        errors[late] = pair
+    left = {late: after / before for late, (before, after) in errors.items() if after < before}
+    best = min(left, key=lambda late: (left[late], abs(late)), default=0)
+    if not left.get(best, 1.0) < LIMITS.max_share_left:
         return {}
     says = f"people are {abs(best)} frames {'late' if best > 0 else 'early'}: corrected, the error"
-    return {where: f"{says} falls from {1000 * errors[0]:.1f} to {1000 * errors[best]:.1f} mm"}
+    return {
+        where: f"{says} falls from {1000 * errors[best][0]:.1f} to {1000 * errors[best][1]:.1f} mm"
+    }
 
 
 def _sample(clip: str, camera: Camera | None, true: Floats, found: Mapping[str, Floats]) -> Sample:

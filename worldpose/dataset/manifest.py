@@ -157,10 +157,18 @@ def stated_rate(folder: Path, clip: str) -> float | None:
     """Return the frame rate of a clip [1/s] that the folder states, or else match.yaml around it.
 
     Raises:
-        InputError: one of both files is invalid.
+        InputError: one of these files is invalid.
     """
+    if (manifest := read_manifest(folder)) is not None:
+        return manifest.fps
     rate = clip_frame_rate(read_frame_rates(folder), clip)
-    around = spec_around(folder) if rate is None else None
+    try:
+        around = spec_around(folder) if rate is None else None
+    except InputError as error:
+        todo = (
+            f"{error.todo} Or, of another match, state the rate: --fps, or {folder}/{FRAME_RATES}."
+        )
+        raise InputError(error.where, error.expected, error.found, todo) from error
     return rate if around is None else around[1].fps
 
 

@@ -336,19 +336,31 @@ def turning_findings(source: PointSource, view: CameraView) -> Iterator[Finding]
     if posed.mean() > 0.5 or not np.isfinite(camera_center(view.rows)).all():
         return
     seen, points = shared[0], source.points[:, :, shared[1]]
-    left = {late: _left(seen, points, view.rows, late) for late in range(-LATEST, LATEST + 1)}
-    best = min(left, key=lambda late: (left[late], abs(late)))
-    if left[0] - left[best] > LIMITS.min_gain_px and left[best] < LIMITS.max_share_left * left[0]:
+    left, still = (
+        {late: _left(seen, points, view.rows, late, at) for late, at in shifts}
+        for shifts in (
+            [(late, late) for late in range(-LATEST, LATEST + 1)],
+            [(late, 0) for late in range(-LATEST, LATEST + 1)],
+        )
+    )
+    gains = {late: left[late] / still[late] for late in left if left[late] < still[late]}
+    best = min(gains, key=lambda late: (gains[late], abs(late)), default=0)
+    if (
+        gains
+        and still[best] - left[best] > LIMITS.min_gain_px
+        and gains[best] < LIMITS.max_share_left
+    ):
         (fault,) = (f for f in frame_faults(moving=False) if f.later_points == best)
-        figures = {"shipped_median_px": min(left[0], 1e6), "explained_median_px": left[best]}
+        figures = {"shipped_median_px": min(still[best], 1e6), "explained_median_px": left[best]}
         where = source.name, f"cameras/{view.name}"
         yield convention(fault.name, fault.says, *where, **figures)
 
 
-def _left(seen: Floats, points: Floats, rows: CameraRows, late: int) -> float:
-    """Return the median residual [px] between 2D and 3D of later frames, after optimal rotations.
+def _left(seen: Floats, points: Floats, rows: CameraRows, late: int, at: int) -> float:
+    """Return the median residual [px] between 2D and 3D `at` frames later, by optimal rotations.
 
-    A frame without enough points is skipped; infinite without any frame.
+    It is of the frames that have one `late` frames later. A frame without enough points is skipped;
+    infinite without any frame.
     """
     camera, center = rows.lens(), camera_center(rows)
     first, last = max(0, -late), min(len(seen), len(points) - late, len(rows.rotation))
@@ -358,7 +370,7 @@ def _left(seen: Floats, points: Floats, rows: CameraRows, late: int) -> float:
     # Minimum number of points of a frame for a rotation estimate: more than one person.
     min_points = 30
     for frame in first + sample_evenly(last - first, max_frames):
-        here, there = seen[frame].reshape(-1, 2), points[frame + late].reshape(-1, 3)
+        here, there = seen[frame].reshape(-1, 2), points[frame + at].reshape(-1, 3)
         plane = camera[int(frame)].normalize(here)
         known = np.isfinite(plane).all(-1) & np.isfinite(there).all(-1)
         if known.sum() < min_points:

@@ -263,10 +263,30 @@ def pool_people(
     )
 
 
-def count_views(reference: JointTracks, match: MatchSpec | None) -> JointTracks:
-    """Return true joints for scores: without `views` if the match has no static camera."""
-    dropped = match is not None and not match.static_cameras
+def drop_views(reference: JointTracks, match: MatchSpec | None) -> JointTracks:
+    """Return true joints for scores: without `views` if the match has no static camera.
+
+    Of an unknown match, views of at most one camera everywhere are a broadcast camera's.
+    """
+    if reference.views is None:
+        return reference
+    alone = match is None and reference.views.max(initial=0) <= 1
+    dropped = alone or (match is not None and not match.static_cameras)
     return replace(reference, views=None) if dropped else reference
+
+
+def require_common(where: str, predicted: Integers, true: Integers) -> None:
+    """Raise InputError if both sides have match frames, and none in common."""
+    sides = predicted, true
+    if all(map(len, sides)) and not len(np.intersect1d(*sides)):
+        own, wanted = (f"{frames.min()} to {frames.max()}" for frames in sides)
+        raise InputError(
+            where,
+            expected=f"match frames of the reference, which has some of {wanted}",
+            found=f"{own}, none in common",
+            todo="Name the prediction of the same clip, number both sides by match frames, or "
+            "predict the labelled frames, with NaN where nobody was found.",
+        )
 
 
 def evaluate_joints(
@@ -301,15 +321,7 @@ def evaluate_joints(
     settings = settings or EvaluationSettings()
     if fps is not None:
         row_rate("evaluate_joints", fps)
-    sides = prediction.frames, reference.frames
-    if all(map(len, sides)) and not len(np.intersect1d(*sides)):
-        own, wanted = (f"{frames.min()} to {frames.max()}" for frames in sides)
-        raise InputError(
-            "frames of the prediction",
-            expected=f"match frames of the reference, which has some of {wanted}",
-            found=f"{own}, none in common",
-            todo="Name the prediction of the same clip, or number both sides by match frames.",
-        )
+    require_common("frames of the prediction", prediction.frames, reference.frames)
     people = select_frames(prediction.joints, prediction.frames, reference.frames)
     distances = joint_distances(people, reference.joints)
     match = match_people(distances, settings.match_gate_m)
@@ -392,9 +404,7 @@ def _counting_joints(reference: JointTracks, settings: EvaluationSettings) -> Fl
     exists = np.isfinite(reference.joints[..., 0])
     counts = exists
     if reference.views is not None:
-        seen = reference.views >= settings.min_views
-        # Nowhere enough: a broadcast camera's, which only tell what it shows.
-        counts = exists & seen if seen.any() else exists
+        counts = exists & (reference.views >= settings.min_views)
     enough = counts.sum(-1) >= settings.min_joint_share * exists.sum(-1)
     return np.asarray(counts & enough[..., None])
 

@@ -115,6 +115,9 @@ def align_positions(
     numbers, names, given, rate = read_positions(path)
     usual = (25.0, 10.0, 50.0, 30.0, 20.0, 12.5, 5.0, 60.0)
     rates = (rate,) if np.isfinite(rate) else usual
+    if fps:  # rows of television rates may lie beside a match of a whole rate, or the reverse
+        slow = tuple(each / 1.001 for each in (rates if np.isfinite(rate) else (30.0, 60.0)))
+        rates = (*rates, *slow, *(1.001 * each for each in rates if np.isfinite(rate)))
     owns = {fps} if fps else {*usual}
     if fps and not np.isfinite(rate) and abs(fps - round(fps)) < 2e-3 * fps:
         owns.add(float(round(fps)))  # 59.94 to 29.97 is 2 to 1, as 60 to 30 is
@@ -175,7 +178,7 @@ def align_positions(
         told = "warning: the positions have no times, and people move too little to tell their rate"
         notes.insert(0, f"{told}; one frame of theirs is taken as {step:g} of the match")
     if step != 1.0:
-        how = "by its times" if fps and np.isfinite(rate) else "by agreement alone"
+        how = "by its times" if step == likely else "by agreement alone"
         notes.insert(0, f"each frame of the positions is {step:g} frames of the match, {how}")
     elif step != likely:
         notes.insert(0, f"places agree frame by frame, not at the times' {rate:g} per second")

@@ -96,8 +96,6 @@ def largest_pose_changes(before: Camera, after: Camera, tracks: JointTracks) -> 
     Cameras are batches (frames,). Only people well inside the image count; (0, 0) without any.
     """
     frames, persons = tracks.joints.shape[:2]
-    if not tracks.joints.size:
-        return 0, 0
     one, two = (
         camera.project(tracks.joints.reshape(frames, -1, 3)).reshape(frames, persons, -1, 2)
         for camera in (before, after)

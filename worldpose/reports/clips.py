@@ -144,8 +144,7 @@ def plot_stadium(
     Shading shows the ground in each single camera's field of view, on and near the pitch if there
     is one: the more cameras see a place, the darker it is.
     """
-    joints = tracks.joints[0] if len(tracks.frames) else np.full(tracks.joints.shape[1:], np.nan)
-    hips = joints[:, COCO17_HIPS, :2].mean(axis=1)
+    hips = tracks.joints[0][:, COCO17_HIPS, :2].mean(axis=1)
     places = [camera.center[None, :2] for camera in cameras.values()] + [hips]
     if pitch is not None:
         places.append(pitch_corners(pitch))

@@ -7,13 +7,14 @@ from camera_builders import look_at_camera
 
 from data_contracts.conventions import COCO17
 from flows.results.dataset import check, count, stated_rates
-from flows.results.evaluation import reference_side, score
+from flows.results.evaluation import score
 from worldpose.body.body_file import OPEN_BODY
 from worldpose.body.model import BodyParameters
 from worldpose.dataset.benchmark import score_folders
 from worldpose.dataset.contents import CameraView, PointSource
 from worldpose.dataset.manifest import write_frame_rates
 from worldpose.dataset.plausibility import turning_findings
+from worldpose.errors import InputError
 from worldpose.formats.joints_file import JointTracks, write_joints, write_poses
 from worldpose.formats.release_cameras import CameraRows
 
@@ -47,6 +48,9 @@ def test_the_rate_is_that_of_the_match_around_unless_the_folder_states_its_own(t
     assert stated_rates(tmp_path / "reference") == {"clip": 25.0}
     assert count([tmp_path / "reference"]).clips["clip"].seconds == 0.4
     assert stated_rates(tmp_path / "reference", 5.0) == {"clip": 5.0}
+    (tmp_path / "match.yaml").write_text("of: another program")
+    with pytest.raises(InputError, match=r"state the rate: --fps, or .*frame_rates\.json"):
+        stated_rates(tmp_path / "reference")
     write_frame_rates(tmp_path / "reference", {"clip": 50.0})
     assert stated_rates(tmp_path / "reference") == {"clip": 50.0}
 
@@ -74,13 +78,14 @@ def test_people_whom_one_camera_saw_count_by_no_door_unless_the_match_has_none(t
     np.testing.assert_allclose(told(), [[1, 10.0]] * 2)
     write_match(tmp_path / "match", "broadcast")
     np.testing.assert_allclose(told(), [[2, 260.0]] * 2)
-    assert reference_side(str(reference)).joints.views is None  # which methods are scored against
     # Those of a broadcast camera alone, without a match that says so.
     (tmp_path / "match" / "match.yaml").unlink()
     for one in (0, 1):
         shown = JointTracks(frames, persons, joints, views=np.minimum(views, one))
         write_joints(reference / "joints.npz", shown)
         np.testing.assert_allclose(told(), [[2, 260.0]] * 2)
+    write_match(tmp_path / "match", "static")
+    assert told()[:, 0].tolist() == [0, 0]
 
 
 def test_a_clip_with_nobody_is_checked_counted_and_scored(tmp_path):
@@ -130,3 +135,38 @@ def test_short_clips_are_scored_and_late_ones_are_told(tmp_path, frames):
     assert same.evaluation.g_mpjpe_mm == pytest.approx(0.0, abs=1e-6)
     assert same.notes == {}
     assert any("1 frames late" in note for note in late.notes.values()) == (frames > 1)
+
+
+def test_a_short_clip_whose_last_frame_is_off_is_not_early_or_late(tmp_path):
+    true = standing(3) + 0.2 * np.arange(3)[:, None, None, None] * [1.0, 0.0, 0.0]
+    found = true.copy()
+    found[2] += [0.0, 0.8, 0.0]
+    for name, some in (("true", true), ("found", found)):
+        tracks = JointTracks(np.arange(3), np.arange(1), some)
+        write_joints(tmp_path / name / "a.joints.npz", tracks)
+    (scores,), _ = score_folders(tmp_path / "true", {"found": tmp_path / "found"})
+    assert scores.notes == {}
+
+
+def test_frames_between_the_labelled_ones_are_refused_by_folder(tmp_path):
+    for name, frames in (("true", [0, 10, 20]), ("found", [1, 4, 7, 11])):
+        tracks = JointTracks(np.array(frames), np.arange(1), standing(len(frames)))
+        write_joints(tmp_path / name / "a.joints.npz", tracks)
+    with pytest.raises(InputError, match=r"none in common.*or predict the labelled frames, with"):
+        score_folders(tmp_path / "true", {"found": tmp_path / "found"})
+
+
+def test_views_of_the_joints_count_for_the_poses_beside_them(tmp_path):
+    still = (np.zeros((2, 5, 3)), np.zeros((2, 5, 69)))
+    transl = np.tile([[[0.0, 0.0, 1.0]], [[5.0, 0.0, 1.0]]], (1, 5, 1))
+    for name, off in (("true", 0.0), ("found", 0.5)):
+        places = transl + off * np.array([0.0, 1.0])[:, None, None] * [1.0, 0.0, 0.0]
+        people = BodyParameters(np.zeros((2, 1, 10)), *still, places)
+        write_poses(tmp_path / name / "poses" / "a.npz", people, OPEN_BODY)
+    views = np.full((5, 2, 17), 3)
+    views[:, 1] = 1
+    tracks = JointTracks(np.arange(5), np.arange(2), standing(5, 2), views=views)
+    write_joints(tmp_path / "true" / "a.joints.npz", tracks)
+    (scores,), _ = score_folders(tmp_path / "true", {"found": tmp_path / "found"})
+    assert scores.clips["a"].persons == 1
+    assert scores.clips["a"].mpjpe_mm == pytest.approx(0.0, abs=1e-3)

@@ -298,6 +298,34 @@ def test_places_of_29_97_rows_a_second_without_times_stay_with_a_match_of_59_94(
     assert not any("warning" in note for note in notes)
 
 
+@pytest.mark.parametrize(
+    ("fps", "rate", "said"), [(60.0, 29.97, None), (25.0, 29.97, None), (59.94, 29.97, 30.0)]
+)
+def test_rows_of_a_television_rate_are_at_their_frames_also_by_nominal_times(
+    tmp_path, fps, rate, said
+):
+    """Each row as one of 30 a second would be off by up to 0.3 m."""
+
+    def walk(frames):
+        return 20.0 * np.sin(frames / 200.0)[:, None]
+
+    mine, _ = tracks()
+    joints = np.tile(mine.joints[:1], (3401, 1, 1, 1))
+    hips = joints[:1, :, 11:13, :2].mean(axis=2)
+    joints[..., 0] += walk(np.arange(3401))[..., None]
+    mine = JointTracks(np.arange(3401), mine.person_ids, joints)
+    rows = np.arange(int(3400 * rate / fps))
+    places = hips + walk(rows * fps / rate)[..., None] * [1.0, 0.0]
+    lines = wide(places).splitlines()
+    if said:
+        times = ["timestamp", *(f"{row / said:.3f}" for row in rows)]
+        lines = [",".join(pair) for pair in zip(lines, times, strict=True)]
+    (tmp_path / "positions.csv").write_text("\n".join(lines))
+    predicted, given, notes = align_positions(tmp_path / "positions.csv", mine, fps=fps)
+    assert notes[0].endswith("by agreement alone")
+    assert evaluate_joints(predicted, given, fps=fps)[0].mpjpe_mm < 2.0
+
+
 def test_people_who_hardly_move_do_not_tell_the_rate_of_places_without_times(tmp_path):
     mine, places = tracks()
     mine = JointTracks(mine.frames - 100, mine.person_ids, np.tile(mine.joints[:1], (30, 1, 1, 1)))

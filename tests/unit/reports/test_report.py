@@ -34,7 +34,6 @@ from worldpose.formats.tables import Positions
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.reports.bodies import BodyTracks
-from worldpose.reports.broadcast import largest_pose_changes
 from worldpose.reports.clips import plot_stadium
 from worldpose.reports.data_set import plot_methods
 from worldpose.reports.drawing import figure_data, note_undrawn_distortion, write_figure
@@ -378,14 +377,9 @@ def test_people_are_drawn_at_their_places_and_in_the_way_of_their_kind():
 
 
 def test_pictures_of_nobody_are_drawn():
-    """No frame, no person, nobody who is true: each is a picture, or the first indices."""
-    empty = tracks(3)
-    nobody = JointTracks(empty.frames, np.zeros(0, int), np.zeros((3, 0, 17, 3)))
-    never = JointTracks(np.zeros(0, int), empty.person_ids, np.zeros((0, 1, 17, 3)))
-    for one in (nobody, never):
-        assert plot_stadium({}, "", one).startswith(b"\x89PNG")
-        few = Camera.stack([camera(3)[0]] * max(1, len(one.frames)))[: len(one.frames)]
-        assert largest_pose_changes(few, few, one) == (0, 0)
+    """No person, nobody who is true: each is a picture."""
+    nobody = JointTracks(tracks(3).frames, np.zeros(0, int), np.zeros((3, 0, 17, 3)))
+    assert plot_stadium({}, "", nobody).startswith(b"\x89PNG")
     gone = np.full((1, 17, 3), np.nan)
     for seen_by in (None, camera(1)[0]):
         for found in (gone, np.ones((1, 17, 3))):

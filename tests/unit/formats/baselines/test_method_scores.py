@@ -2,6 +2,7 @@
 
 import csv
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -60,6 +61,16 @@ def test_known_error_gives_the_known_row(name, truth, tmp_path):
         assert found.per_meter_drift_cm_per_m == pytest.approx(path, rel=0.1)
         # Alone or not: every person's error is the same.
         assert found.g_scale == pytest.approx(1.0, abs=1e-4)
+
+
+def test_everybody_counts_where_one_camera_saw_all(tmp_path):
+    bodies, camera = scene()
+    true = truth_of(bodies)
+    views = np.ones(true.joints.shape[:3], np.int64)
+    write_joints(tmp_path / "joints.npz", replace(true, views=views))
+    path = WRITERS[NOT_SEEN](tmp_path, bodies, camera)
+    found = scored(NOT_SEEN, path, tmp_path).evaluation
+    assert (found.persons, found.track_coverage) == (true.joints.shape[1], 1.0)
 
 
 def test_table_has_the_papers_rows_and_says_where_a_figure_means_nothing(truth, tmp_path):
