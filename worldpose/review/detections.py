@@ -104,7 +104,9 @@ def find_objection(found: KeypointDetections, edit: DetectionEdit) -> str | None
 
 def _with_place(found: KeypointDetections, detection: int) -> KeypointDetections:
     """Return observations with room for a detection index; new entries are NaN."""
-    more = max(0, detection + 1 - found.score.shape[1])
+    more = detection + 1 - found.score.shape[1]
+    if more <= 0:
+        return found
     widened = {
         name: np.pad(
             array, [(0, 0), (0, more)] + [(0, 0)] * (array.ndim - 2), constant_values=np.nan
