@@ -15,7 +15,7 @@ from flows.review.detections import replay_objections, require_seen
 from flows.review.edit_conflicts import StaleEditError
 from flows.review.identities import identities_now, lost_names, require_fitting
 from flows.stage import Match
-from worldpose.errors import InputError
+from worldpose.errors import InputError, StoreError
 from worldpose.ingest.match_folder import MatchFolder
 from worldpose.review.clicks import Replay, add_previous_value, current_value, replay_corrections
 from worldpose.review.detections import DETECTION_EDITS
@@ -100,7 +100,7 @@ def objections_now(store: Store, match: Match, latest: RunRecord | None) -> dict
                 objections = identities_now(store, match, owner, with_joints=False).objections
             else:
                 objections = replay_objections(store, match, owner)
-        except InputError:  # nothing is replayed before the next run, and pages say why
+        except (InputError, StoreError):  # nothing is replayed before the next run, which tells why
             continue
         for each, why in zip(made, objections, strict=True):
             if why and not isinstance(each.edit, NamedTrack):  # a name can be given again
