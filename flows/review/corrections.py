@@ -11,7 +11,7 @@ from data_contracts.match import Registration
 from data_contracts.review import Correction, Edit, MovedPoint, NamedTrack, RedrawnMarking
 from data_contracts.run import RunRecord
 from flows.layers import add_venue, read_layers
-from flows.review.detections import replay_objections, require_seen
+from flows.review.detections import objections_in, replay_objections, require_seen
 from flows.review.edit_conflicts import StaleEditError
 from flows.review.identities import identities_now, lost_names, require_fitting
 from flows.stage import Match
@@ -76,9 +76,7 @@ def objections_of(run: Run) -> dict[str, str]:
         sources = run.manifest(unit).recipe.sources
         taken = sources.get("identities") or sources["edits"]
         assert isinstance(taken, list)  # corrections as JSON
-        unknown = "the result does not tell whether it applies: run the match again"  # an older one
-        objections = run[unit].attrs.get("objections", [unknown] * len(taken))
-        for edit, why in zip(taken, objections, strict=True):
+        for edit, why in zip(taken, objections_in(run, unit, taken), strict=True):
             name = next((it for it in said if said[it] == edit), "")
             said.pop(name, None)  # of two that are equal, the second can be refused
             found |= {name: why} if name and why else {}

@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 import numpy as np
+from pydantic import JsonValue, TypeAdapter
 
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.review import Acceptance, Edit
@@ -24,11 +25,12 @@ from flows.stages.ingest import edits_by_camera
 from worldpose.errors import InputError
 from worldpose.review.detections import (
     DETECTION_EDITS,
+    DetectionEdit,
     find_objection,
     replay_detections,
 )
 from worldpose.review.journal import say
-from worldpose.store.store import Store
+from worldpose.store.store import Run, Store
 
 if TYPE_CHECKING:
     from worldpose.review.evidence import OpenDetections
@@ -75,6 +77,23 @@ def require_seen(store: Store, match: Match, edits: Sequence[Edit]) -> None:
                 frame=edit.frame,
             )
         found[place] = replay_detections(found[place], [edit]).observations
+
+
+def objections_in(run: Run, name: str, taken: Sequence[JsonValue]) -> Sequence[str | None]:
+    """Return why each correction that a result has `taken` in does not apply; None if it does.
+
+    Results of older versions lack this: it is replayed over the result without corrections.
+    """
+    told: Sequence[str | None] | None = run[name].attrs.get("objections")
+    if told is not None:
+        return told
+    edits = TypeAdapter(list[DetectionEdit]).validate_python(taken)
+    stored = open_stored(run.store, run.record, name, "edits")
+    if stored.edits:
+        return ["the result does not tell whether it applies: run the match again"] * len(taken)
+    edited = np.isin(stored.result["frame"].values, [edit.frame for edit in edits])
+    found = KeypointDetections.from_arrays(stored.result.isel(frame=edited))  # all can be many
+    return replay_detections(found, edits).objections
 
 
 def replay_objections(store: Store, match: Match, camera: str) -> list[str | None]:
