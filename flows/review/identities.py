@@ -9,6 +9,7 @@ from pydantic import JsonValue
 
 from data_contracts.review import Edit, MergedTracks, NamedTrack, SplitTrack
 from flows.review.edit_conflicts import (
+    MOST_REPLAYED,
     StaleEditError,
     StoredResult,
     edits_since,
@@ -31,6 +32,12 @@ from worldpose.review.journal import Journal, read_journal
 from worldpose.store.store import Run, Store
 
 
+def said_of(match: Match, clip: str) -> list[IdentityEdit]:
+    """Return a clip's identity corrections that apply to the match folder, in order."""
+    edits = (correction.edit for correction in match.corrections)
+    return [edit for edit in edits if isinstance(edit, IDENTITY_EDITS) and edit.clip == clip]
+
+
 def identities_now(
     store: Store, match: Match, clip: str, *, with_joints: bool = True
 ) -> IdentityReplay:
@@ -40,11 +47,7 @@ def identities_now(
         InputError: the latest run has no tracks of this clip, or only with a correction that was
             withdrawn since.
     """
-    said = [
-        correction.edit
-        for correction in match.corrections
-        if isinstance(correction.edit, IDENTITY_EDITS) and correction.edit.clip == clip
-    ]
+    said = said_of(match, clip)
     name, match_id = f"tracking/{clip}", match.match_id
     results = store.run(match_id).results if store.runs(match_id) else {}
     require_results([name] if name in results else [], f"clip {clip}", "tracks", match_id)
@@ -58,6 +61,30 @@ def identities_now(
     as_json = [edit.model_dump(mode="json") for edit in moves[: len(taken)]]
     in_run = len(taken) if as_json == taken else 0  # some can be withdrawn
     return _replay(stored, said, stated, in_run, with_joints=with_joints)
+
+
+def identity_objections(store: Store, match: Match, clip: str) -> dict[int, str | None]:
+    """Return why a clip's corrections that its latest tracks lack do not apply, by their index.
+
+    Those of them that apply have None. Objections to all others are in the tracks. After more than
+    `MOST_REPLAYED` merges and splits, or before any tracks, there are none.
+
+    Raises:
+        InputError: as `identities_now`.
+    """
+    said = said_of(match, clip)
+    moves = [edit for edit in said if isinstance(edit, TRACK_EDITS)]
+    run, name = store.run(match.match_id), f"tracking/{clip}"
+    require_results([name] if name in run.results else [], f"clip {clip}", "tracks", run.match_id)
+    stored = open_stored(store, run, name, "identities", moves)
+    later = edits_since(moves, stored.edits, f"clip {clip}", run.match_id)
+    is_own = bool(stored.edits) or run.results[name] == stored.plain
+    if len(later) > MOST_REPLAYED or (is_own and not later):
+        return {}
+    replay = _replay(stored, said, {}, len(stored.edits), with_joints=False)
+    contained = (n for n, edit in enumerate(said) if isinstance(edit, TRACK_EDITS))
+    first = [*contained][len(stored.edits)] if stored.edits else 0
+    return dict([*enumerate(replay.objections)][first:])
 
 
 def names_said(match: Match) -> str:

@@ -1,6 +1,7 @@
 """Corrections of identities over stored tracks, with and without those before the corrections."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,8 +9,9 @@ import xarray as xr
 from run_records import correction
 
 from data_contracts.review import MergedTracks, MovedPoint, NamedTrack, SplitTrack
-from flows.review import identities
+from flows.review import corrections, identities
 from flows.review.edit_conflicts import StoredResult
+from worldpose.errors import StoreError
 from worldpose.review.identities import IdentityReplay, replay_identities, stored_identities
 from worldpose.review.journal import Journal
 
@@ -96,6 +98,58 @@ def test_an_edit_is_kept_with_sightings_and_applies_to_no_other_person_of_the_id
     assert replay_identities(other, [edit]).objections == (None,)
     (why,) = replay_identities(other, [full]).objections
     assert "is not the person that was seen" in why
+
+
+@pytest.mark.parametrize(
+    ("said", "made", "told"),
+    [
+        ([split(0, 6), named(3, "Al"), merge(2, 9)], [split(0, 6)], {2: "no person 9"}),
+        ([split(0, 6), named(3, "Al"), named(4, "Bo")], [], {0: None, 1: None, 2: "no person 4"}),
+        ([split(0, 6), named(3, "Al")], [split(0, 6)], {}),
+        ([named(3, "Al"), named(1, "Bo")], [merge(0, 1)], {0: "no person 3", 1: None}),  # withdrawn
+        ([split(0, 6), merge(0, 3)] * 26, [], {}),  # too many
+    ],
+)
+def test_what_the_latest_tracks_lack_alone_is_replayed_up_to_a_limit(said, made, told, monkeypatch):
+    as_json = [edit.model_dump(mode="json") for edit in made]
+
+    def opened(store, run, name, source, moves):
+        is_own = made and as_json == [edit.model_dump(mode="json") for edit in moves[: len(made)]]
+        return StoredResult(tracks(*(made if is_own else ())), "plain", as_json if is_own else [])
+
+    monkeypatch.setattr(identities, "open_stored", opened)
+    results = {"tracking/clip": "own" if made else "plain"}
+    store = SimpleNamespace(run=lambda _: SimpleNamespace(match_id="m", results=results))
+    match = SimpleNamespace(match_id="m", corrections=[correction(edit, "c") for edit in said])
+    found = identities.identity_objections(store, match, "clip")
+    assert found.keys() == told.keys()
+    assert all(found[n] is why if why is None else why in found[n] for n, why in told.items())
+
+
+def test_objections_are_replayed_once_for_results_and_corrections(monkeypatch):
+    class Kept:
+        """A store."""
+
+    store, asked = Kept(), []
+
+    def replay(store, match, clip):
+        asked.append(clip)
+        if clip == "gone":
+            raise StoreError("withdrawn")
+        return {0: None, 1: "no person 9"}
+
+    monkeypatch.setattr(corrections, "Run", lambda *_: None)
+    monkeypatch.setattr(corrections, "objections_of", lambda _: {"n": "lost", "x": "refused"})
+    monkeypatch.setattr(corrections, "identity_objections", replay)
+    gone = SplitTrack(clip="gone", person=0, first_frame_of_new=6)
+    made = [correction(named(3, "Al"), "n"), correction(merge(2, 9), "m"), correction(gone, "g")]
+    match = SimpleNamespace(match_id="m", corrections=made)
+    for key in "aab":
+        record = SimpleNamespace(results={"tracking/clip": key})
+        found = corrections.objections_now(store, match, record)
+        assert found == {"x": "refused", "m": "no person 9"}
+    assert asked.count("clip") == 2
+    assert corrections.objections_now(store, match, None) == {}
 
 
 def journal(said, withdrawn=()):
