@@ -112,8 +112,9 @@ def replay_objections(store: Store, match: Match, camera: str) -> dict[int, str 
     for name in results_of(store, match, camera):
         own = [*range(len(said))]
         if not name.startswith("ingest/"):  # which takes in all
-            key = run.results[name]
-            frame = store.open_result(match.match_id, *name.split("/", 1), key)["frame"].values
+            stage, _, unit = name.partition("/")
+            result = store.open_result(match.match_id, stage, unit, run.results[name])
+            frame = result["frame"].values
             own = [n for n in own if frame[0] <= said[n].frame <= frame[-1]]
         edits = [said[n] for n in own]
         stored = open_stored(store, run, name, "edits", edits)

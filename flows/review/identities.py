@@ -55,7 +55,7 @@ def identities_now(
     moves = [edit for edit in said if isinstance(edit, TRACK_EDITS)]
     edits_since(moves, stored.edits, f"clip {clip}", match_id)
     stated = _stated_names(store, match_id, clip)
-    made = store.manifest(match_id, *name.split("/", 1), results[name]).recipe.sources
+    made = store.manifest(match_id, "tracking", clip, results[name]).recipe.sources
     taken = made.get("identities") or []
     assert isinstance(taken, list)  # corrections as JSON
     as_json = [edit.model_dump(mode="json") for edit in moves[: len(taken)]]
