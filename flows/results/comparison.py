@@ -152,7 +152,8 @@ def _subject(stage: str, unit: str, part: str, names: Mapping[tuple[str, str], s
     if not part:
         return "clip", unit
     if stage == "bodies":
-        return "player", f"{unit}: {names.get((unit, part), part)}".replace("person", "person ")
+        name = names.get((unit, part), part).replace("person", "person ")
+        return "player", f"{unit}: {name}"
     return "camera", part
 
 

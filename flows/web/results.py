@@ -282,7 +282,7 @@ def _name_as_after(
 ) -> list[SubjectChange]:
     """Name players by their ids in the second run, which the metrics and names of a page have."""
     names = {
-        f"{clip}: {other}".replace("person", "person "): f"{clip}: person {person[6:]}"
+        f"{clip}: person {other[6:]}": f"{clip}: person {person[6:]}"
         for (clip, person), other in paired.items()
     }
     return [
