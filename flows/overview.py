@@ -33,7 +33,7 @@ from flows.method import METHOD
 from flows.patience import SILENT_SECONDS, read_in_time
 from flows.registering import open_for_review
 from flows.results.timings import Cost
-from flows.review.corrections import objections_now
+from flows.review.corrections import objections_of
 from flows.review.descriptions import is_first_click
 from flows.review.metric_words import all_reasons
 from flows.review.verdicts import reviews_of, still_waiting
@@ -49,7 +49,7 @@ from worldpose.store.documents import seal, unseal
 from worldpose.store.paths import record_path, registration_path, summary_path
 from worldpose.store.recipes import libraries
 from worldpose.store.runs import run_order
-from worldpose.store.store import Store
+from worldpose.store.store import Run, Store
 
 PAGE: Final = 50
 """Matches of a page."""
@@ -340,7 +340,7 @@ def _summarize(store: Store, draft: MatchSummary) -> MatchSummary:
     except (OSError, WorldposeError) as error:  # a setting can name a missing file
         now = describe_problem(error)
     first = sum(map(is_first_click, match.corrections))
-    lost = len(objections_now(store, match, latest))
+    lost = 0 if latest is None else len(objections_of(Run(store, latest)))
     found |= {
         "waiting": tuple(_questions(store, match, latest)),
         "to_click": match.folder.to_click,

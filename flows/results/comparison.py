@@ -76,13 +76,19 @@ class SubjectChange:
     figures: tuple[Change, ...]
 
 
-def compare_runs(store: Store, a: RunRecord, b: RunRecord) -> list[SubjectChange]:
+def compare_runs(
+    store: Store,
+    a: RunRecord,
+    b: RunRecord,
+    paired: Mapping[tuple[str, str], str] | None = None,
+) -> list[SubjectChange]:
     """Compare the match, its clips, cameras and players in B with A.
 
     Players are paired by position, whatever their ids; a player in only one run is marked so.
+    `paired` are their pairs, if they are known.
     """
     before = _subjects(a, {})
-    after = _subjects(b, paired_people(store, a, b))
+    after = _subjects(b, paired_people(store, a, b) if paired is None else paired)
     return [
         _change(subject, before.get(subject), after.get(subject))
         for subject in sorted(before.keys() | after.keys(), key=_order)
@@ -146,7 +152,8 @@ def _subject(stage: str, unit: str, part: str, names: Mapping[tuple[str, str], s
     if not part:
         return "clip", unit
     if stage == "bodies":
-        return "player", f"{unit}: {names.get((unit, part), part)}".replace("person", "person ")
+        name = names.get((unit, part), part).replace("person", "person ")
+        return "player", f"{unit}: {name}"
     return "camera", part
 
 

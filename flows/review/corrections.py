@@ -11,11 +11,11 @@ from data_contracts.match import Registration
 from data_contracts.review import Correction, Edit, MovedPoint, NamedTrack, RedrawnMarking
 from data_contracts.run import RunRecord
 from flows.layers import add_venue, read_layers
-from flows.review.detections import replay_objections, require_seen
+from flows.review.detections import objections_in, replay_objections, require_seen
 from flows.review.edit_conflicts import StaleEditError
-from flows.review.identities import identities_now, lost_names, require_fitting
+from flows.review.identities import identity_objections, lost_names, require_fitting
 from flows.stage import Match
-from worldpose.errors import InputError
+from worldpose.errors import InputError, StoreError
 from worldpose.ingest.match_folder import MatchFolder
 from worldpose.review.clicks import Replay, add_previous_value, current_value, replay_corrections
 from worldpose.review.detections import DETECTION_EDITS
@@ -76,9 +76,7 @@ def objections_of(run: Run) -> dict[str, str]:
         sources = run.manifest(unit).recipe.sources
         taken = sources.get("identities") or sources["edits"]
         assert isinstance(taken, list)  # corrections as JSON
-        unknown = "the result does not tell whether it applies: run the match again"  # an older one
-        objections = run[unit].attrs.get("objections", [unknown] * len(taken))
-        for edit, why in zip(taken, objections, strict=True):
+        for edit, why in zip(taken, objections_in(run, unit, taken), strict=True):
             name = next((it for it in said if said[it] == edit), "")
             said.pop(name, None)  # of two that are equal, the second can be refused
             found |= {name: why} if name and why else {}
@@ -87,25 +85,49 @@ def objections_of(run: Run) -> dict[str, str]:
 
 def objections_now(store: Store, match: Match, latest: RunRecord | None) -> dict[str, str]:
     """Return why corrections in force do not apply to the latest run, or to what pages show."""
-    found = {} if latest is None else objections_of(Run(store, latest))
-    replayed: dict[tuple[str, bool], list[Correction]] = {}
+    if latest is None:
+        return {}
+    found = objections_of(Run(store, latest))
+    made: dict[tuple[str, bool], list[Correction]] = {}
     for each in match.corrections:
         if isinstance(each.edit, (*IDENTITY_EDITS, *DETECTION_EDITS)):
             key = owner_of(each.edit), isinstance(each.edit, IDENTITY_EDITS)
-            replayed.setdefault(key, []).append(each)
-    for (owner, is_clip), made in replayed.items():
-        try:
-            objections: Sequence[str | None]
-            if is_clip:
-                objections = identities_now(store, match, owner, with_joints=False).objections
-            else:
-                objections = replay_objections(store, match, owner)
-        except InputError:  # nothing is replayed before the next run, and pages say why
-            continue
-        for each, why in zip(made, objections, strict=True):
-            if why and not isinstance(each.edit, NamedTrack):  # a name can be given again
-                found[each.id] = why
+            made.setdefault(key, []).append(each)
+    kept = _TOLD.setdefault(store, {})
+    before, told = kept.pop(match.match_id, (latest.results, {}))
+    told = told if before == latest.results else {}
+    kept[match.match_id] = (latest.results, told)
+    while len(kept) > MOST_KEPT:
+        kept.pop(next(iter(kept)), None)
+    for place, corrections in made.items():
+        owner, is_clip = place
+        ids = tuple(each.id for each in corrections)
+        if place not in told or told[place][0] != ids:
+            replay = identity_objections if is_clip else replay_objections
+            try:
+                told[place] = ids, replay(store, match, owner)
+            except (InputError, StoreError):  # nothing is replayed before the next run: it says why
+                continue
+        for number, why in told[place][1].items():
+            each = corrections[number]
+            if not isinstance(each.edit, NamedTrack):
+                found |= {each.id: why} if why else {}
+            elif why is None:  # the run lacks the person, whom a correction since made
+                found.pop(each.id, None)
     return found
+
+
+_TOLD: WeakKeyDictionary[
+    Store,
+    dict[
+        str,
+        tuple[
+            Mapping[str, str],
+            dict[tuple[str, bool], tuple[tuple[str, ...], dict[int, str | None]]],
+        ],
+    ],
+] = WeakKeyDictionary()
+"""Match to the latest results and, by camera or clip, corrections in force and their objections."""
 
 
 def new_corrections(

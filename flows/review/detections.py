@@ -8,10 +8,12 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 import numpy as np
+from pydantic import JsonValue, TypeAdapter
 
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.review import Acceptance, Edit
 from flows.review.edit_conflicts import (
+    MOST_REPLAYED,
     StaleEditError,
     StoredResult,
     edits_since,
@@ -24,11 +26,12 @@ from flows.stages.ingest import edits_by_camera
 from worldpose.errors import InputError
 from worldpose.review.detections import (
     DETECTION_EDITS,
+    DetectionEdit,
     find_objection,
     replay_detections,
 )
 from worldpose.review.journal import say
-from worldpose.store.store import Store
+from worldpose.store.store import Run, Store
 
 if TYPE_CHECKING:
     from worldpose.review.evidence import OpenDetections
@@ -77,25 +80,51 @@ def require_seen(store: Store, match: Match, edits: Sequence[Edit]) -> None:
         found[place] = replay_detections(found[place], [edit]).observations
 
 
-def replay_objections(store: Store, match: Match, camera: str) -> list[str | None]:
-    """Return why each of a camera's corrections does not apply to the detections that pages show.
+def objections_in(run: Run, name: str, taken: Sequence[JsonValue]) -> Sequence[str | None]:
+    """Return why each correction that a result has `taken` in does not apply; None if it does.
 
-    Those that the latest run contains count as applied, if it has no result without them.
+    Results of older versions lack this: it is replayed over the result without corrections.
+    """
+    told: Sequence[str | None] | None = run[name].attrs.get("objections")
+    if told is not None:
+        return told
+    edits = TypeAdapter(list[DetectionEdit]).validate_python(taken)
+    stored = open_stored(run.store, run.record, name, "edits")
+    if stored.edits:
+        return ["the result does not tell whether it applies: run the match again"] * len(taken)
+    edited = np.isin(stored.result["frame"].values, [edit.frame for edit in edits])
+    found = KeypointDetections.from_arrays(stored.result.isel(frame=edited))  # all can be many
+    return replay_detections(found, edits).objections
+
+
+def replay_objections(store: Store, match: Match, camera: str) -> dict[int, str | None]:
+    """Return why a camera's corrections that its latest results lack do not apply, by their index.
+
+    Those of them that apply have None. Objections to all others are in the results. Of a result
+    that lacks more than `MOST_REPLAYED`, there are none.
 
     Raises:
         InputError: as `detections_now`.
     """
     said = edits_by_camera(match).get(camera, [])
-    objections: list[str | None] = [None] * len(said)
+    objections: dict[int, str | None] = {}
+    run = store.run(match.match_id)
     for name in results_of(store, match, camera):
-        stored = _open(store, match, name)
-        frame = stored.result["frame"].values
-        own = [n for n, each in enumerate(said) if each.frame in range(frame[0], frame[-1] + 1)]
-        later = edits_since([said[n] for n in own], stored.edits, camera, match.match_id)
-        edited = stored.result.isel(frame=np.isin(frame, [edit.frame for edit in later]))
-        replay = replay_detections(KeypointDetections.from_arrays(edited), later)
-        for n, why in zip(own[len(own) - len(later) :], replay.objections, strict=True):
-            objections[n] = why
+        own = [*range(len(said))]
+        if not name.startswith("ingest/"):  # which takes in all
+            stage, _, unit = name.partition("/")
+            result = store.open_result(match.match_id, stage, unit, run.results[name])
+            frame = result["frame"].values
+            own = [n for n in own if frame[0] <= said[n].frame <= frame[-1]]
+        edits = [said[n] for n in own]
+        stored = open_stored(store, run, name, "edits", edits)
+        later = edits_since(edits, stored.edits, camera, match.match_id)
+        if not 0 < len(later) <= MOST_REPLAYED:
+            continue
+        edited = np.isin(stored.result["frame"].values, [edit.frame for edit in later])
+        found = KeypointDetections.from_arrays(stored.result.isel(frame=edited))
+        whys = replay_detections(found, later).objections
+        objections |= dict(zip(own[len(own) - len(later) :], whys, strict=True))
     return objections
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 from pydantic import JsonValue
 
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 E = TypeVar("E", bound=Record)
+MOST_REPLAYED: Final = 50
+"""Most corrections of a camera or clip that are replayed to tell of them: a page waits for it."""
 
 
 class StaleEditError(InputError):
@@ -75,8 +77,13 @@ class StoredResult(NamedTuple):
     edits: list[JsonValue]
 
 
-def open_stored(store: Store, run: RunRecord, name: str, source: str) -> StoredResult:
-    """Open a run's result by `stage/unit`; `source` names its recipe's corrections."""
+def open_stored(
+    store: Store, run: RunRecord, name: str, source: str, said: Sequence[Record] = ()
+) -> StoredResult:
+    """Open a run's result by `stage/unit`; `source` names its recipe's corrections.
+
+    If these are the first of `said`, the result itself is opened, with its corrections.
+    """
     stage, _, unit = name.partition("/")
     match_id, key = run.match_id, run.results[name]
     recipe = store.manifest(match_id, stage, unit, key).recipe
@@ -84,7 +91,8 @@ def open_stored(store: Store, run: RunRecord, name: str, source: str) -> StoredR
     taken_in = sources.pop(source, None) or []
     assert isinstance(taken_in, list)
     plain = recipe_key(recipe.model_copy(update={"sources": sources}))
-    if store.has(match_id, stage, unit, plain):
+    is_own = taken_in == [edit.model_dump(mode="json") for edit in said[: len(taken_in)]]
+    if not (said and is_own) and store.has(match_id, stage, unit, plain):
         key, taken_in = plain, []
     return StoredResult(store.open_result(match_id, stage, unit, key), plain, taken_in)
 

@@ -9,6 +9,7 @@ from pydantic import JsonValue
 
 from data_contracts.review import Edit, MergedTracks, NamedTrack, SplitTrack
 from flows.review.edit_conflicts import (
+    MOST_REPLAYED,
     StaleEditError,
     StoredResult,
     edits_since,
@@ -31,6 +32,12 @@ from worldpose.review.journal import Journal, read_journal
 from worldpose.store.store import Run, Store
 
 
+def said_of(match: Match, clip: str) -> list[IdentityEdit]:
+    """Return a clip's identity corrections that apply to the match folder, in order."""
+    edits = (correction.edit for correction in match.corrections)
+    return [edit for edit in edits if isinstance(edit, IDENTITY_EDITS) and edit.clip == clip]
+
+
 def identities_now(
     store: Store, match: Match, clip: str, *, with_joints: bool = True
 ) -> IdentityReplay:
@@ -40,11 +47,7 @@ def identities_now(
         InputError: the latest run has no tracks of this clip, or only with a correction that was
             withdrawn since.
     """
-    said = [
-        correction.edit
-        for correction in match.corrections
-        if isinstance(correction.edit, IDENTITY_EDITS) and correction.edit.clip == clip
-    ]
+    said = said_of(match, clip)
     name, match_id = f"tracking/{clip}", match.match_id
     results = store.run(match_id).results if store.runs(match_id) else {}
     require_results([name] if name in results else [], f"clip {clip}", "tracks", match_id)
@@ -52,7 +55,36 @@ def identities_now(
     moves = [edit for edit in said if isinstance(edit, TRACK_EDITS)]
     edits_since(moves, stored.edits, f"clip {clip}", match_id)
     stated = _stated_names(store, match_id, clip)
-    return _replay(stored, said, stated, with_joints=with_joints)
+    made = store.manifest(match_id, "tracking", clip, results[name]).recipe.sources
+    taken = made.get("identities") or []
+    assert isinstance(taken, list)  # corrections as JSON
+    as_json = [edit.model_dump(mode="json") for edit in moves[: len(taken)]]
+    in_run = len(taken) if as_json == taken else 0  # some can be withdrawn
+    return _replay(stored, said, stated, in_run, with_joints=with_joints)
+
+
+def identity_objections(store: Store, match: Match, clip: str) -> dict[int, str | None]:
+    """Return why a clip's corrections that its latest tracks lack do not apply, by their index.
+
+    Those of them that apply have None. Objections to all others are in the tracks. After more than
+    `MOST_REPLAYED` merges and splits, or before any tracks, there are none.
+
+    Raises:
+        InputError: as `identities_now`.
+    """
+    said = said_of(match, clip)
+    moves = [edit for edit in said if isinstance(edit, TRACK_EDITS)]
+    run, name = store.run(match.match_id), f"tracking/{clip}"
+    require_results([name] if name in run.results else [], f"clip {clip}", "tracks", run.match_id)
+    stored = open_stored(store, run, name, "identities", moves)
+    later = edits_since(moves, stored.edits, f"clip {clip}", run.match_id)
+    is_own = bool(stored.edits) or run.results[name] == stored.plain
+    if len(later) > MOST_REPLAYED or (is_own and not later):
+        return {}
+    replay = _replay(stored, said, {}, len(stored.edits), with_joints=False)
+    contained = (n for n, edit in enumerate(said) if isinstance(edit, TRACK_EDITS))
+    first = [*contained][len(stored.edits)] if stored.edits else 0
+    return dict([*enumerate(replay.objections)][first:])
 
 
 def names_said(match: Match) -> str:
@@ -113,15 +145,14 @@ def _replay_names(run: Run, clip: str) -> tuple[dict[str, str], dict[int, str]]:
     assert isinstance(moves, list)
     said = _said_in(journal, clip, moves)
     stored = open_stored(run.store, run.record, unit, "identities")
-    replay = _replay(stored, [*said.values()], stated, with_joints=False)
+    replay = _replay(stored, [*said.values()], stated, len(moves), with_joints=False)
     ids, names = replay.identities.person.tolist(), replay.identities.names
     lost |= {
         name: f"{edit.name!r} names no person: {why}. Name the person again, or withdraw the name"
         for (name, edit), why in zip(said.items(), replay.objections, strict=True)
         if isinstance(edit, NamedTrack) and edit.name and why and edit.name not in names.values()
     }
-    gone = _merged_away([*said.values()], replay.objections)
-    return lost | _lost_stated(clip, stated, {*ids} - gone, names), names
+    return lost | _lost_stated(clip, stated, ids, names), names
 
 
 def _said_in(journal: Journal, clip: str, moves: Sequence[JsonValue]) -> dict[str, IdentityEdit]:
@@ -160,8 +191,7 @@ def _lost_stated(
     """Return why names of match.yaml fit no person, by clip and person."""
     return {
         f"{clip}/{person}": f"{name!r} in match.yaml names no person: clip {clip} has no person "
-        f"{person} that no merge removed. Correct the clip's `people`, or name the person by a "
-        "correction"
+        f"{person}. Correct the clip's `people`"
         for person, name in stated.items()
         if person not in ids and name not in names.values()
     }
@@ -171,13 +201,15 @@ def _replay(
     stored: StoredResult,
     said: Sequence[IdentityEdit],
     stated: Mapping[int, str],
+    in_run: int,
     *,
     with_joints: bool = True,
 ) -> IdentityReplay:
     """Replay corrections over a result, which can contain the first merges and splits already.
 
     People whom no correction names, or leaves without a name, have the names `stated`, unless a
-    merge removed their id. The objections are in the order of `said`.
+    merge removed their id and the run, which contains the first `in_run` merges and splits, has no
+    person with it. The objections are in the order of `said`.
     """
     merged, others = dict[int, IdentityEdit](), dict[int, IdentityEdit]()
     moves = (number for number, edit in enumerate(said) if isinstance(edit, TRACK_EDITS))
@@ -199,7 +231,7 @@ def _replay(
     replay = replay_identities(tracks, order.values())
     found = taken | dict(zip(order, replay.objections, strict=True))
     objections = tuple(found.get(number) for number in range(len(said)))
-    nameless = _merged_away(said, objections) | {
+    nameless = _merged_away(tracks.person.tolist(), said, objections, len(taken), in_run) | {
         edit.person
         for number, edit in others.items()
         if isinstance(edit, NamedTrack) and edit.name is None and found[number] is None
@@ -209,10 +241,32 @@ def _replay(
     return IdentityReplay(replace(now, names=left | now.names), objections)
 
 
-def _merged_away(said: Sequence[IdentityEdit], objections: Sequence[str | None]) -> set[int]:
-    """Return the ids that merges removed; later a split can give them to other people."""
-    edits = zip(said, objections, strict=True)
-    return {edit.merged for edit, why in edits if isinstance(edit, MergedTracks) and why is None}
+def _merged_away(
+    ids: Sequence[int],
+    said: Sequence[IdentityEdit],
+    objections: Sequence[str | None],
+    taken: int,
+    in_run: int,
+) -> set[int]:
+    """Return ids that merges removed and the run lacks; a later split can give them to others.
+
+    The ids are those after the first merges and splits that were `taken`.
+    """
+    now, gone = {*ids}, set[int]()
+    moves = [
+        (edit, why)
+        for edit, why in zip(said, objections, strict=True)
+        if isinstance(edit, TRACK_EDITS)
+    ]
+    for number, (edit, why) in enumerate([*moves, (None, None)]):
+        if number == in_run:
+            gone -= now
+        if why is None and isinstance(edit, MergedTracks):
+            gone.add(edit.merged)
+            now -= {edit.merged} if number >= taken else set()
+        elif why is None and isinstance(edit, SplitTrack) and number >= taken:
+            now.add(max(now) + 1)  # as the replay numbers the new person
+    return gone
 
 
 def require_fitting(store: Store, match: Match, edits: Sequence[Edit]) -> list[Edit]:

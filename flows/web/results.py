@@ -282,7 +282,7 @@ def _name_as_after(
 ) -> list[SubjectChange]:
     """Name players by their ids in the second run, which the metrics and names of a page have."""
     names = {
-        f"{clip}: {other}".replace("person", "person "): f"{clip}: person {person[6:]}"
+        f"{clip}: person {other[6:]}": f"{clip}: person {person[6:]}"
         for (clip, person), other in paired.items()
     }
     return [
@@ -305,10 +305,9 @@ def _describe_metrics(context: PageContext, match: Match, run: Run) -> dict[str,
     if parent is not None:
         try:
             before = context.store.run(match.match_id, parent)
+            paired = paired_people(context.store, before, record)
             changes = _name_as_after(
-                compare_runs(context.store, before, record),
-                paired_people(context.store, before, record),
-                parent,
+                compare_runs(context.store, before, record, paired), paired, parent
             )
         except WorldposeError as error:  # its results may be garbage collected
             problem = f"Run {parent} cannot be compared: {describe_error(error)}"

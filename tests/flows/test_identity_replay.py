@@ -1,6 +1,7 @@
 """Corrections of identities over stored tracks, with and without those before the corrections."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,8 +9,9 @@ import xarray as xr
 from run_records import correction
 
 from data_contracts.review import MergedTracks, MovedPoint, NamedTrack, SplitTrack
-from flows.review import identities
+from flows.review import corrections, identities
 from flows.review.edit_conflicts import StoredResult
+from worldpose.errors import StoreError
 from worldpose.review.identities import IdentityReplay, replay_identities, stored_identities
 from worldpose.review.journal import Journal
 
@@ -45,13 +47,14 @@ def named(person, name):
     return NamedTrack(clip="clip", person=person, name=name)
 
 
-def replay(said, taken=0, stated=None):
+def replay(said, taken=0, stated=None, in_run=None):
     """Replay corrections over the tracks with the first of the merges and splits."""
     moves = [edit for edit in said if not isinstance(edit, NamedTrack)][:taken]
     stored = StoredResult(
         tracks(*moves), "0" * 32, [each.model_dump(mode="json") for each in moves]
     )
-    return identities._replay(stored, said, stated or {}, with_joints=False)
+    in_run = taken if in_run is None else in_run
+    return identities._replay(stored, said, stated or {}, in_run, with_joints=False)
 
 
 @pytest.mark.parametrize("taken", range(5))
@@ -65,18 +68,20 @@ def test_an_edit_made_twice_is_replayed_twice_whatever_the_tracks_contain(taken)
     assert [bool(why) for why in found.objections] == [False, False, False, False, True, False]
 
 
-@pytest.mark.parametrize("taken", range(5))
-def test_a_name_of_the_match_folder_is_not_that_of_who_gets_the_id_later(taken):
+@pytest.mark.parametrize(("in_run", "taken"), [(n, k) for n in range(5) for k in {0, n}])
+def test_a_name_of_the_match_folder_is_of_whom_the_run_gives_the_id(in_run, taken):
     stated = {1: "bea", 2: "cleo", 3: "dora"}
     said = [split(2, 6), merge(2, 3), merge(1, 9), split(1, 6)]
-    after = replay(said, taken, stated)
-    found, gone = after.identities, identities._merged_away(said, after.objections)
-    assert (found.person.tolist(), found.names) == ([0, 1, 2, 3], {1: "bea", 2: "cleo"})
-    (why,) = identities._lost_stated("clip", stated, {0, 1, 2, 3} - gone, found.names).values()
-    assert "'dora' in match.yaml names no person: clip clip has no person 3 that no merge" in why
+    found = replay(said, taken, stated, in_run).identities
+    assert found.person.tolist() == [0, 1, 2, 3]
+    # A merge of the run, or one since, removed the id, unless the run has given it again.
+    assert found.names == (stated if in_run == 4 else {1: "bea", 2: "cleo"})
+    again = [*said, merge(1, 3), split(0, 6)]
+    assert replay(again, taken, stated, in_run).identities.names == {1: "bea", 2: "cleo"}
     # A split alone, and merges that do not apply, take no name away.
     refused = [split(1, 6), merge(0, 2), merge(9, 3)]
-    assert replay(refused, min(taken, 3), stated).identities.names == stated
+    taken, in_run = min(taken, 3), min(in_run, 3)
+    assert replay(refused, taken, stated, in_run).identities.names == stated
 
 
 @pytest.mark.parametrize("edit", [merge(0, 3), split(2, 6), named(2, "x")])
@@ -93,6 +98,58 @@ def test_an_edit_is_kept_with_sightings_and_applies_to_no_other_person_of_the_id
     assert replay_identities(other, [edit]).objections == (None,)
     (why,) = replay_identities(other, [full]).objections
     assert "is not the person that was seen" in why
+
+
+@pytest.mark.parametrize(
+    ("said", "made", "told"),
+    [
+        ([split(0, 6), named(3, "Al"), merge(2, 9)], [split(0, 6)], {2: "no person 9"}),
+        ([split(0, 6), named(3, "Al"), named(4, "Bo")], [], {0: None, 1: None, 2: "no person 4"}),
+        ([split(0, 6), named(3, "Al")], [split(0, 6)], {}),
+        ([named(3, "Al"), named(1, "Bo")], [merge(0, 1)], {0: "no person 3", 1: None}),  # withdrawn
+        ([split(0, 6), merge(0, 3)] * 26, [], {}),  # too many
+    ],
+)
+def test_what_the_latest_tracks_lack_alone_is_replayed_up_to_a_limit(said, made, told, monkeypatch):
+    as_json = [edit.model_dump(mode="json") for edit in made]
+
+    def opened(store, run, name, source, moves):
+        is_own = made and as_json == [edit.model_dump(mode="json") for edit in moves[: len(made)]]
+        return StoredResult(tracks(*(made if is_own else ())), "plain", as_json if is_own else [])
+
+    monkeypatch.setattr(identities, "open_stored", opened)
+    results = {"tracking/clip": "own" if made else "plain"}
+    store = SimpleNamespace(run=lambda _: SimpleNamespace(match_id="m", results=results))
+    match = SimpleNamespace(match_id="m", corrections=[correction(edit, "c") for edit in said])
+    found = identities.identity_objections(store, match, "clip")
+    assert found.keys() == told.keys()
+    assert all(found[n] is why if why is None else why in found[n] for n, why in told.items())
+
+
+def test_objections_are_replayed_once_for_results_and_corrections(monkeypatch):
+    class Kept:
+        """A store."""
+
+    store, asked = Kept(), []
+
+    def replay(store, match, clip):
+        asked.append(clip)
+        if clip == "gone":
+            raise StoreError("withdrawn")
+        return {0: None, 1: "no person 9"}
+
+    monkeypatch.setattr(corrections, "Run", lambda *_: None)
+    monkeypatch.setattr(corrections, "objections_of", lambda _: {"n": "lost", "x": "refused"})
+    monkeypatch.setattr(corrections, "identity_objections", replay)
+    gone = SplitTrack(clip="gone", person=0, first_frame_of_new=6)
+    made = [correction(named(3, "Al"), "n"), correction(merge(2, 9), "m"), correction(gone, "g")]
+    match = SimpleNamespace(match_id="m", corrections=made)
+    for key in "aab":
+        record = SimpleNamespace(results={"tracking/clip": key})
+        found = corrections.objections_now(store, match, record)
+        assert found == {"x": "refused", "m": "no person 9"}
+    assert asked.count("clip") == 2
+    assert corrections.objections_now(store, match, None) == {}
 
 
 def journal(said, withdrawn=()):

@@ -227,15 +227,20 @@ def test_a_folders_digest_is_of_the_names_and_contents_below_it():
 
 
 def test_the_page_of_a_run_names_its_people_by_the_ids_of_that_run():
-    paired = {("c", "person3"): "person5", ("c", "person5"): "person5 of B"}
+    paired = {("person1", "person3"): "person5", ("person1", "person5"): "person5 of B"}
     rows = [
-        ("c: person 5", "worse"),
-        ("c: person 5 of B", "only in B"),
-        ("c: person 3", "only in A"),
+        ("person1: person 5", "worse"),
+        ("person1: person 5 of B", "only in B"),
+        ("person1: person 3", "only in A"),
     ]
     changes = [SubjectChange("player", name, mark, ()) for name, mark in rows]
-    changes += [SubjectChange("player", "c: person 1", "better", ())]
-    changes += [SubjectChange("camera", "c: person 3", "only in A", ())]
+    changes += [SubjectChange("player", "person1: person 1", "better", ())]
+    changes += [SubjectChange("camera", "person1: person 3", "only in A", ())]
     named = [each.name for each in _name_as_after(changes, paired, "0002")]
-    people = ["c: person 3", "c: person 5", "c: person 3 of run 0002", "c: person 1"]
-    assert named == [*people, "c: person 3"]
+    people = [
+        "person1: person 3",
+        "person1: person 5",
+        "person1: person 3 of run 0002",
+        "person1: person 1",
+    ]
+    assert named == [*people, "person1: person 3"]

@@ -49,7 +49,8 @@ def replay_detections(found: KeypointDetections, edits: Iterable[DetectionEdit])
     )
     objections = []
     for edit in edits:
-        objection = find_objection(changed, edit)
+        # Places of people whose corrections were withdrawn since stay, and nobody fills them.
+        objection = find_objection(changed, edit, unfilled=99)
         objections.append(objection)
         if objection is not None:
             continue
@@ -71,8 +72,13 @@ def replay_detections(found: KeypointDetections, edits: Iterable[DetectionEdit])
     return DetectionReplay(changed, tuple(objections))
 
 
-def find_objection(found: KeypointDetections, edit: DetectionEdit) -> str | None:
-    """Return why an edit does not apply to a camera's detections; None if it does."""
+def find_objection(
+    found: KeypointDetections, edit: DetectionEdit, *, unfilled: int = 0
+) -> str | None:
+    """Return why an edit does not apply to a camera's detections; None if it does.
+
+    An added person can leave at most `unfilled` places free before it.
+    """
     place = f"detection {edit.detection} of {edit.camera} in frame {edit.frame}"
     row = _row(found, edit.frame)
     if row is None:
@@ -80,7 +86,7 @@ def find_objection(found: KeypointDetections, edit: DetectionEdit) -> str | None
     places = found.score.shape[1]
     is_there = 0 <= edit.detection < places and not np.isnan(found.score[row, edit.detection])
     if isinstance(edit, AddedDetection):
-        if edit.detection > places + 99:  # places of people whose corrections were withdrawn stay
+        if edit.detection > places + unfilled:
             return f"{place} would leave places free before it: {places} is the next"
         return f"there is a {place} already" if is_there else None
     if not is_there:
@@ -104,7 +110,9 @@ def find_objection(found: KeypointDetections, edit: DetectionEdit) -> str | None
 
 def _with_place(found: KeypointDetections, detection: int) -> KeypointDetections:
     """Return observations with room for a detection index; new entries are NaN."""
-    more = max(0, detection + 1 - found.score.shape[1])
+    more = detection + 1 - found.score.shape[1]
+    if more <= 0:
+        return found
     widened = {
         name: np.pad(
             array, [(0, 0), (0, more)] + [(0, 0)] * (array.ndim - 2), constant_values=np.nan

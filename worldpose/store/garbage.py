@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from functools import cache, partial
 
 from data_contracts.run import Reservation, RunRecord
 from worldpose.errors import CorruptionError, InputError, StoreError
@@ -77,10 +78,11 @@ def plan_gc(
     reached: set[ResultId] = set()
     damaged: dict[str, str] = {}
     for match_id in _matches_with_runs(sizes):
+        read = cache(partial(store.run, match_id))
         try:
-            dropped, kept = _select_runs(store, match_id, keep_last, forget)
+            dropped, kept = _select_runs(store, match_id, read, keep_last, forget)
             for run_id in kept:
-                _add_reached_results(store, store.run(match_id, run_id), reached)
+                _add_reached_results(store, read(run_id), reached)
             reservations = list(_reservations(store, match_id, sizes))
         except (CorruptionError, InputError) as error:
             damaged[match_id] = f"Match {match_id} is skipped: {error}"
@@ -182,26 +184,30 @@ def _check_arguments(store: Store, keep_last: int | None, forget: Collection[str
 
 
 def _select_runs(
-    store: Store, match_id: str, keep_last: int | None, forget: Collection[str]
+    store: Store,
+    match_id: str,
+    read: Callable[[str], RunRecord],
+    keep_last: int | None,
+    forget: Collection[str],
 ) -> tuple[list[str], list[str]]:
     """Return the ids of the finished runs to drop, and of those to keep."""
     finished, pinned = store.runs(match_id), _pin_names(store, match_id)
     wanted = [run_id for run_id in finished if f"{match_id}/{run_id}" not in forget]
     chosen = {*pinned, *wanted}
     if keep_last is not None:
-        last = {*finished[-keep_last:], *_find_last_of_stages(store, match_id, wanted)}
+        last = {*finished[-keep_last:], *_find_last_of_stages(read, wanted)}
         chosen = {*pinned, *({*wanted} & last)}
     kept = [run_id for run_id in finished if run_id in chosen]
     return [run_id for run_id in finished if run_id not in kept], kept
 
 
-def _find_last_of_stages(store: Store, match_id: str, run_ids: Sequence[str]) -> Iterator[str]:
+def _find_last_of_stages(read: Callable[[str], RunRecord], run_ids: Sequence[str]) -> Iterator[str]:
     """Yield the newest complete runs with results of each stage; partial ones for other stages."""
     had: set[str] = set()
     for state in ("complete", "partial"):
         for run_id in reversed(run_ids):
             try:
-                record = store.run(match_id, run_id)
+                record = read(run_id)
             except (CorruptionError, InputError):  # if it is kept, its match is skipped
                 continue
             stages = {name.partition("/")[0] for name in record.results}

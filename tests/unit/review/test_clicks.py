@@ -24,7 +24,12 @@ from worldpose.errors import InputError
 from worldpose.formats.annotations.annotated_images import AnnotatedImage, AnnotatedPerson
 from worldpose.ingest.match_folder import MatchFolder
 from worldpose.review.clicks import replay_corrections
-from worldpose.review.detections import find_changes, image_name, replay_detections
+from worldpose.review.detections import (
+    find_changes,
+    find_objection,
+    image_name,
+    replay_detections,
+)
 from worldpose.review.journal import append, read_journal
 from worldpose.store.blobs import Entry
 from worldpose.store.store import Store
@@ -377,6 +382,8 @@ def test_an_added_person_takes_a_free_place_and_is_certain():
 def test_an_added_person_stays_when_one_that_was_added_before_is_withdrawn():
     first, second = added_person(2), added_person(3, nose=(7.0, 8.0))
     moved = keypoint((1.0, 1.0), was=(7.0, 8.0), frame=FIRST + 1, detection=3)
+    assert "2 is the next" in str(find_objection(observations(), second))  # if it is made now
+    assert find_objection(observations(), first) is None
     both = replay_detections(observations(), [first, second, moved])
     one = replay_detections(observations(), [second, moved])
     assert (both.objections, one.objections) == ((None,) * 3, (None,) * 2)
