@@ -227,8 +227,8 @@ def _read_people(
         plural = {f"{poses}": f"read {read}, as public readers name it"} if keys else {}
     tracks = JointTracks(np.arange(count), np.arange(joints.shape[1]), joints)
     shape = joints[rows].shape[:3]  # poses tell no views, and joints of the same people may
-    views = [each.views for each in shipped.sources if each.views is not None]
-    if same := [each for each in views if each.shape == shape]:
+    told = [each.views for each in shipped.sources if each.views is not None]
+    if same := [each for each in told if each.shape == shape]:
         seen = np.zeros(joints.shape[:3], np.int64)
         seen[rows] = same[0]
         tracks = replace(tracks, views=seen)

@@ -28,6 +28,7 @@ from worldpose.dataset.manifest import (
     origins_of,
     read_manifest,
     released_files,
+    stated_rate,
     write_frame_rates,
     write_manifest,
     write_origins,
@@ -167,6 +168,7 @@ def test_a_manifest_comes_back_and_holds_the_conventions(tmp_path):
     manifest = manifest_of(tmp_path)
     path = write_manifest(tmp_path, manifest)
     assert read_manifest(tmp_path) == manifest
+    assert stated_rate(tmp_path, "A_1") == 50.0
     stored = json.loads(path.read_text())
     assert "x_cam = R x_world + t" in stored["conventions"]["camera"]
     assert stored["files"][0]["path"] == "joints.npz"
