@@ -208,10 +208,8 @@ def test_a_fit_without_the_pixels_of_markings_takes_no_mean_of_nothing():
     camera, rng = people.seat(1)
     clicked = people.click(camera, rng, count=9).clicked
     drawn = people.draw(camera, ["touch_line_far", "halfway_line"], rng)
-    both, settings = (
-        ClickedMarkings(points=clicked.points, drawn=drawn),
-        StaticCalibrationSettings(),
-    )
+    both = ClickedMarkings(points=clicked.points, drawn=drawn)
+    settings = StaticCalibrationSettings()
     problem = build_problem(gather_evidence(PITCH, both, SIZE, 0.5, "test"), SIZE, settings)
     alone = problem.select(np.ones(9, np.bool_), np.zeros(2, np.bool_))
     with warnings.catch_warnings():
