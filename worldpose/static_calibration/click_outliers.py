@@ -330,9 +330,9 @@ def _select_markings(
         ]
     )
     accepted = np.asarray(medians < settings.wrong_marking * settings.drawn_noise_px)
-    constraints = np.where(evidence.straight, 2, 4)
-    all_constraints = 2 * len(inliers) + int(constraints.sum())
-    remaining = 2 * int(inliers.sum()) + int(constraints[accepted].sum())
+    every = np.ones_like(inliers), np.ones_like(accepted)
+    all_constraints = evidence.count_constraints(*every)
+    remaining = evidence.count_constraints(inliers, accepted)
     share = 1.0 - settings.max_wrong_share
     few = accepted.sum() < share * len(accepted) and remaining < 8
     enough = remaining >= share * all_constraints and not few

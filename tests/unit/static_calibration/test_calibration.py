@@ -191,6 +191,20 @@ def test_a_rolled_camera_keeps_its_right_clicks_and_says_its_roll(roll, size):
     assert not any("rolled" in each for each in level.report.decisions)
 
 
+def test_no_roll_explains_a_wrong_name_of_a_level_camera():
+    # One of four names is wrong; a free roll fits them all, at -161 degrees.
+    clicked = people.points(
+        {
+            "goal_area_left_far_back": (168.0, 509.4),
+            "corner_left_far": (614.9, 437.4),
+            "goal_area_left_far_front": (272.0, 519.1),
+            "halfway_far": (705.2, 500.9),
+        }
+    )
+    with pytest.raises(InputError):
+        calibrate_camera(PITCH, clicked, people.SIZE)
+
+
 def test_a_marking_under_another_ones_name_is_named_and_left_out():
     camera, rng = people.seat(1)
     drawn = list(people.draw(camera, list(PITCH.lines), rng, noise=0.5))
