@@ -104,15 +104,16 @@ def export(
     sizes = {
         path: f", {path.stat().st_size / 1e6:.1f} MB" for path in written if path.suffix == ".html"
     }
+    off = []
     for path in (path for path in written if path.name == LENS_ERRORS):
-        told = json.loads(path.read_text()).values()
-        off = max(each["max_error_px"] for each in told)
-        sizes[path] = f": lenses in cameras/ differ from those used by up to {off:.2g} px"
-        if any(each["max_error_beyond_px"] != 0.0 for each in told):
-            angle = min(each["fitted_angle_deg"] for each in told)
-            sizes[path] += f" within {angle:.0f} degrees of the axis, and more beyond"
+        for camera, each in json.loads(path.read_text()).items():
+            most, beyond = each["max_error_px"], each["max_error_beyond_px"]
+            off.append(f"lens of {camera} in cameras/: up to {most:.2g} px off the one used")
+            if beyond != 0.0:
+                more = "the lens folds" if beyond is None else f"up to {beyond:.2g} px"
+                off[-1] += f"; {more} beyond {each['fitted_angle_deg']:.0f} degrees"
     told = (f"wrote {path}{sizes.get(path, '')}" for path in written)
-    answer({"match": name, "files": [str(path) for path in written]}, *told)
+    answer({"match": name, "files": [str(path) for path in written]}, *told, *off)
 
 
 def read_licence(file: Path) -> str:

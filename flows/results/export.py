@@ -87,6 +87,14 @@ def export_worldpose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     with_people = best_results.find_clips(origin.run.record)
     rates = (unit_frames(origin.spec, view).rate for view in broadcast_views(origin.run))
     others = bool(with_people or origin.static_cameras) or 1.0 in rates
+    # Before the first file: one lens that cannot be followed refuses the export.
+    cameras = dict(origin.static_cameras)
+    errors: dict[str, dict[str, str | float | None]] = {}
+    for name, camera in cameras.items():
+        if camera.lens_model != LensModel.BROWN:
+            kind = LensModel(int(camera.lens_model)).label
+            cameras[name], told = fit_brown_lens(camera, f"--format worldpose: {name}")
+            errors[name] = {"lens_model": kind, **told}
     for clip in best_results.all_clips(origin.run):
         if clip in with_people:
             model, poses, _ = best_results.fitted_bodies(origin.run, clip)
@@ -104,13 +112,8 @@ def export_worldpose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
         told = [each.model_dump() for each in view_changes(origin.run, clip)]
         path.write_text(json.dumps(told, indent=1), encoding="utf-8")
         yield path
-    errors: dict[str, dict[str, str | float | None]] = {}
-    for name, camera in origin.static_cameras.items():
+    for name, camera in cameras.items():
         path = out / "cameras" / f"{name}.npz"
-        if camera.lens_model != LensModel.BROWN:
-            kind = LensModel(int(camera.lens_model)).label
-            camera, told = fit_brown_lens(camera, f"--format worldpose: {name}")
-            errors[name] = {"lens_model": kind, **told}
         write_static_camera(path, camera.to_calibration(name))
         yield path
     if errors:

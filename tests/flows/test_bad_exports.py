@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from camera_builders import look_at_camera
 from command_line import TINY, worldpose
 from test_release_formats import match_folder, origin, tracked
 from typer.testing import CliRunner
@@ -19,9 +20,11 @@ from data_contracts.release import EXPORT_FORMATS, EXPORT_PURPOSES
 from flows.cli.app import app
 from flows.results import export as export_module
 from flows.results import outputs
+from flows.results.best_results import Origin
 from flows.results.export import CLASHING, COUNTED, EXPORTS, export
 from flows.results.outputs import OWNERS
 from worldpose.errors import InputError, UsageError, WorldposeError
+from worldpose.geometry.lens_models import LensModel
 
 __all__ = ["match_folder"]  # a fixture
 
@@ -215,6 +218,20 @@ def test_people_without_bodies_are_no_cameras_alone(match_folder, tmp_path, left
     results[f"{left}__A_1"] = whole()["triangulation__A_1"]
     with pytest.raises(InputError, match="results of body_fitting/A_1"):
         export(origin(match_folder, **results), ["worldpose"], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_lens_that_cannot_be_followed_is_refused_before_the_first_file(
+    match_folder, tmp_path, monkeypatch
+):
+    cameras = {  # half of the image is beyond 70 degrees
+        "north": replace(
+            look_at_camera([0, -20, 5], [0, 0, 0], 400.0), lens_model=LensModel.FISHEYE
+        )
+    }
+    monkeypatch.setattr(Origin, "static_cameras", cameras)
+    with pytest.raises(InputError, match=r"worldpose: north: .*in half of the image"):
+        list(EXPORTS["worldpose"](origin(match_folder, **whole()), tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 
 

@@ -123,8 +123,8 @@ def fit_brown_lens(
     """Return a single camera with the nearest lens of Brown's model, and its errors.
 
     Focal length and principal point follow, too; the pose stays. Near 90 degrees from the axis no
-    polynomial follows a fisheye, and places there would spoil the middle: the fit is to the widest
-    cone about the axis in which its errors are small.
+    polynomial follows a fisheye, and places there would spoil the middle: if a fit to the whole
+    image has gross errors, it is to the widest cone about the axis in which errors are small.
 
     Returns:
         The camera, and `max_error_px` within `fitted_angle_deg` of the axis, and
@@ -133,20 +133,24 @@ def fit_brown_lens(
     Raises:
         InputError: errors are small in less than half of the image.
     """
-    most_px, least_share = 2.0, 0.5
+    # Small and gross errors [px]: 2.2 and 11 px of Full HD.
+    most_px, gross_px = (share * float(np.hypot(*camera.image_size)) for share in (0.001, 0.005))
+    least_share = 0.5
     free = (*INTRINSICS, *COEFFICIENTS["brown"])
     pixels = camera.image_grid()
     plane = camera.normalize(pixels)
     angle = np.degrees(np.arctan(np.hypot(*plane.T)))
-    for limit in np.nanmax(angle) * np.linspace(1.0, 0.5, 11):
+    for share in np.linspace(1.0, 0.5, 11):
+        limit = share * np.nanmax(angle)
         near, far = angle <= limit, angle > limit
         fit = fit_lens(camera, plane[near], pixels[near], LensModel.BROWN, free)
-        if fit.error_px <= most_px or near.mean() < least_share:
+        follows = fit.error_px <= (gross_px if share == 1.0 else most_px)
+        if follows or near.mean() < least_share:
             break
-    if not (fit.error_px <= most_px and near.mean() >= least_share):
+    if not follows or near.mean() < least_share:
         raise InputError(
             where,
-            expected=f"a lens that Brown's model follows to {most_px:g} px in half of the image",
+            expected=f"a lens that Brown's model follows to {most_px:.2g} px in half of the image",
             found=f"errors of {fit.error_px:.2g} px within {limit:.0f} degrees of the axis",
             todo="Export a format with the lens itself, or leave this camera out.",
         )

@@ -368,10 +368,8 @@ def _check_size(spec: PitchSpec, where: str) -> None:
             todo,
         )
     for name, most in _largest(spec).items():
-        size, expected = (
-            spec.sizes.get(name, 0.0),
-            f"at most {most:g} m, where other markings begin",
-        )
+        size = spec.sizes.get(name, 0.0)
+        expected = f"at most {most:g} m, where other markings begin"
         _require(size <= most, f"{where}: dimensions.{name}", expected, f"{size:g}", todo)
 
 

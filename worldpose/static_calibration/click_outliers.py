@@ -284,10 +284,7 @@ def held_out_error(problem: CameraProblem, fit: InlierFit) -> float:
         on = evidence.drawn_marking == index
         units.append((rows.drawn[on], rows.by_drawn[on], problem.drawn_noise[on]))
     total, count = 0.0, 0
-    size = np.sqrt(np.diag(fit.tangent_covariance))
-    size[size == 0.0] = 1.0  # parameters that may not move
-    values, axes = np.linalg.eigh(fit.tangent_covariance / np.outer(size, size))
-    root = size[:, None] * axes * np.sqrt(np.maximum(values, 0.0))
+    root = covariance_root(fit.tangent_covariance)
     for residual, by_step, noise in units:
         # A marking has thousands of pixels, but their hat matrix has rank 12.
         sigma = np.broadcast_to(noise * fit.noise_scale, len(residual))
@@ -301,6 +298,17 @@ def held_out_error(problem: CameraProblem, fit: InlierFit) -> float:
         total += float(predicted @ predicted)
         count += len(residual)
     return float(np.sqrt(total / max(count, 1)))
+
+
+def covariance_root(covariance: Floats) -> Floats:
+    """Return R (12, 12) with R R^T = covariance (12, 12), also where rounding makes it indefinite.
+
+    Coefficients of the lens and meters differ by many powers of ten.
+    """
+    size = np.sqrt(np.diag(covariance))
+    size[size == 0.0] = 1.0  # parameters that may not move
+    values, axes = np.linalg.eigh(covariance / np.outer(size, size))
+    return np.asarray(size[:, None] * axes * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _select_markings(
@@ -322,9 +330,9 @@ def _select_markings(
         ]
     )
     accepted = np.asarray(medians < settings.wrong_marking * settings.drawn_noise_px)
-    constraints = np.where(evidence.straight, 2, 4)
-    all_constraints = 2 * len(inliers) + int(constraints.sum())
-    remaining = 2 * int(inliers.sum()) + int(constraints[accepted].sum())
+    every = np.ones_like(inliers), np.ones_like(accepted)
+    all_constraints = evidence.count_constraints(*every)
+    remaining = evidence.count_constraints(inliers, accepted)
     share = 1.0 - settings.max_wrong_share
     few = accepted.sum() < share * len(accepted) and remaining < 8
     enough = remaining >= share * all_constraints and not few

@@ -64,6 +64,10 @@ class ClickEvidence:
             drawn_marking=self.drawn_marking[on],
         )
 
+    def count_constraints(self, points: Flags, markings: Flags) -> int:
+        """Return how many numbers of a camera clicks (n,) and drawn markings (m,) can tell."""
+        return 2 * int(points.sum()) + int(np.where(self.straight, 2, 4)[markings].sum())
+
     def on_surface(self, surface: Floats) -> ClickEvidence:
         """Return the evidence at its places on another surface.
 

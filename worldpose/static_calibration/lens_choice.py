@@ -16,6 +16,7 @@ from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.click_outliers import (
     CLEAR_GAIN,
     Explanation,
+    covariance_root,
     fit_inliers_at_best_noise,
     negative_log_posterior,
     scale_noise,
@@ -116,7 +117,7 @@ def widen_by_lenses(
         step = np.zeros(STEP)
         rows = by_step[known][:, :, problem.free].reshape(-1, int(problem.free.sum()))
         # In standard deviations: a direction that moves no pixel of the pitch gets no step.
-        unit = np.linalg.cholesky(fit.covariance[np.ix_(problem.free, problem.free)])
+        unit = covariance_root(fit.covariance)[problem.free]
         found_step = np.linalg.lstsq(rows @ unit, apart[known].ravel(), rcond=1e-4)[0]
         step[problem.free] = unit @ found_step
         size = float(np.sqrt(((by_step[known] @ step) ** 2).sum(axis=1).mean()))

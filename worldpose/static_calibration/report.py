@@ -164,7 +164,7 @@ def build_report(
         drawn.append(MarkingResidual(name, len(off), rms, worst, bool(fit.markings[index])))
     ground_error = ground_error_map(estimate, pitch, settings.map_step_m)
     reasons = _accuracy_reasons(ground_error, fit, settings)
-    # Only a plane seen from straight above leaves more than a fifth to the prior.
+    # Few clicks, or a view from straight above, leave more than a fifth to the prior.
     if (open_focal := float(np.sqrt(estimate.covariance[6, 6]))) > 0.2:
         reasons.append(
             f"height {estimate.camera.center[2]:.1f} m and focal length "

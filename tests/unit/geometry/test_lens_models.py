@@ -228,13 +228,26 @@ def test_browns_nearest_lens_states_its_largest_error(model, lens):
     assert 0.2 * error < off.max() <= 1.01 * error < 0.1
 
 
+@pytest.mark.parametrize(("scale", "error"), [(1, 4.8), (2, 9.6)])
+def test_browns_lens_of_an_ordinary_fisheye_holds_in_the_corners(scale, error):
+    stated = {"focal_px": (1100.0 * scale,) * 2, "image_size": (1920 * scale, 1080 * scale)}
+    stated |= {"principal_point_px": (960.0 * scale - 0.5, 540.0 * scale - 0.5)}
+    stated |= {"lens_model": "fisheye", "distortion": (0.0,) * 4}
+    camera = Camera.from_calibration(calibration("a", **stated))  # the corners are at 57 degrees
+    near, told = fit_brown_lens(camera)
+    rays = camera.unproject(camera.image_grid())
+    off = near.project(rays.origins + 5.0 * rays.directions) - camera.image_grid()
+    assert np.linalg.norm(off, axis=1).max() == pytest.approx(error, rel=0.05)
+    assert told["max_error_beyond_px"] == 0.0
+
+
 def test_the_corners_of_a_very_wide_fisheye_do_not_spoil_the_middle_of_browns_lens():
     # Equidistant with k1 = 0: the corners, 400 px off, are at 400 / 300 rad = 76 degrees.
     stated = {"focal_px": (300.0, 300.0), "principal_point_px": (319.5, 239.5)}
     stated |= {"image_size": (640, 480), "lens_model": "fisheye"}
     camera = Camera.from_calibration(calibration("a", distortion=(0.0,) * 4, **stated))
     near, told = fit_brown_lens(camera)
-    assert told["max_error_px"] <= 2.0
+    assert told["max_error_px"] <= 0.8  # a thousandth of the diagonal
     assert told["max_error_beyond_px"] is None  # the polynomial folds before the corners
     limit = told["fitted_angle_deg"]
     assert 45.0 < limit < 76.5

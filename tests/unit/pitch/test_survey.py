@@ -111,7 +111,7 @@ def test_a_full_survey_of_a_small_pitch_is_in_metres(template, size):
     # Two thirds of the usual pitch is another unit: its penalty areas are smaller than prescribed.
     usual = PitchTemplate.from_spec(PitchSpec(template=template))
     places = usual.positions(list(usual.points)) * 0.65
-    with pytest.raises(InputError):
+    with pytest.raises(InputError, match=r"of the true length"):
         fit_survey(Survey("survey.csv", tuple(usual.points), places, template))
     # Four corners do not tell.
     corners = true.positions(CORNERS)

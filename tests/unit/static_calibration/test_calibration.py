@@ -191,6 +191,20 @@ def test_a_rolled_camera_keeps_its_right_clicks_and_says_its_roll(roll, size):
     assert not any("rolled" in each for each in level.report.decisions)
 
 
+def test_no_roll_explains_a_wrong_name_of_a_level_camera():
+    # One of four names is wrong; a free roll fits them all, at -161 degrees.
+    clicked = people.points(
+        {
+            "goal_area_left_far_back": (168.0, 509.4),
+            "corner_left_far": (614.9, 437.4),
+            "goal_area_left_far_front": (272.0, 519.1),
+            "halfway_far": (705.2, 500.9),
+        }
+    )
+    with pytest.raises(InputError):
+        calibrate_camera(PITCH, clicked, people.SIZE)
+
+
 def test_a_marking_under_another_ones_name_is_named_and_left_out():
     camera, rng = people.seat(1)
     drawn = list(people.draw(camera, list(PITCH.lines), rng, noise=0.5))
@@ -208,10 +222,8 @@ def test_a_fit_without_the_pixels_of_markings_takes_no_mean_of_nothing():
     camera, rng = people.seat(1)
     clicked = people.click(camera, rng, count=9).clicked
     drawn = people.draw(camera, ["touch_line_far", "halfway_line"], rng)
-    both, settings = (
-        ClickedMarkings(points=clicked.points, drawn=drawn),
-        StaticCalibrationSettings(),
-    )
+    both = ClickedMarkings(points=clicked.points, drawn=drawn)
+    settings = StaticCalibrationSettings()
     problem = build_problem(gather_evidence(PITCH, both, SIZE, 0.5, "test"), SIZE, settings)
     alone = problem.select(np.ones(9, np.bool_), np.zeros(2, np.bool_))
     with warnings.catch_warnings():

@@ -11,6 +11,7 @@ from worldpose.geometry.lens_models import LensModel
 from worldpose.pitch.template import PitchTemplate, Surface
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import place_camera
+from worldpose.static_calibration.click_outliers import covariance_root
 from worldpose.static_calibration.curvature_correction import ClicksAndBars, free_on_pitch
 from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.evidence import gather_evidence
@@ -112,6 +113,17 @@ def test_few_clicks_state_the_error_of_lenses_that_fit_them_as_well(lens):
             assert np.nanquantile(errors, 0.95) < 2.0 * found.report.ground_error.p95
     if lens == "brown":
         assert found.report.ground_error.p95 < 0.35
+
+
+def test_a_covariance_that_rounding_makes_indefinite_has_a_root():
+    # Two directions from meters to coefficients, a fixed parameter, and rounding.
+    axes = np.random.default_rng(0).normal(size=(12, 2)) * np.geomspace(1e6, 1e-6, 12)[:, None]
+    covariance = axes @ axes.T
+    covariance[4], covariance[:, 4] = 0.0, 0.0
+    with pytest.raises(np.linalg.LinAlgError):
+        np.linalg.cholesky(covariance)
+    root, size = covariance_root(covariance), np.geomspace(1e6, 1e-6, 12)
+    np.testing.assert_allclose((root @ root.T - covariance) / np.outer(size, size), 0.0, atol=1e-9)
 
 
 def test_browns_model_stands_unless_a_fisheye_is_clearly_more_probable(calibrated):
