@@ -6,10 +6,9 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from contextlib import suppress
 from dataclasses import dataclass, field
-from threading import Thread
 from typing import Any, Final, Generic, TypeVar
 
 T = TypeVar("T")
@@ -17,7 +16,7 @@ T = TypeVar("T")
 SILENT_SECONDS: Final = 10.0
 """A disk that has not answered for so long is silent."""
 SHORT_SECONDS: Final = 1.0
-"""The same while another read is late: many matches can be on one silent disk."""
+"""Wait of the impatient while another disk is silent: many matches can be on it."""
 
 
 @dataclass
@@ -29,8 +28,8 @@ class _Late(Generic[T]):
     made: Future[T] = field(default_factory=Future)
     clock: Callable[[], float] | None = None
     """Processor time of its thread [s]: it stands still while the disk does not answer."""
-    spent: float = -1.0
-    moved_at: float = -math.inf
+    spent: float = 0.0
+    moved_at: float = field(default_factory=time.monotonic)
 
     def run(self, read: Callable[[list[T]], T]) -> None:
         self.clock = clock_of_this_thread()
@@ -39,17 +38,17 @@ class _Late(Generic[T]):
         except Exception as error:
             self.made.set_exception(error)
 
-    def is_slow(self) -> bool:
-        """Return whether the disk has answered since the last call, or within `SILENT_SECONDS`."""
+    def is_silent(self) -> bool:
+        """Return whether its disk has not answered for `SILENT_SECONDS`, as far as was looked."""
         with suppress(OSError):  # the thread has just ended
             spent = 0.0 if self.clock is None else self.clock()
-            if spent != self.spent >= 0.0:
-                self.moved_at = time.monotonic()
-            self.spent = spent
-        return time.monotonic() - self.moved_at < SILENT_SECONDS
+            if spent != self.spent:
+                self.spent, self.moved_at = spent, time.monotonic()
+        return not self.made.done() and time.monotonic() - self.moved_at >= SILENT_SECONDS
 
 
 _LATE: Final[dict[object, _Late[Any]]] = {}
+_LOCK: Final = threading.Lock()
 
 
 def read_in_time(
@@ -63,25 +62,24 @@ def read_in_time(
         first: what is known before.
         is_patient: wait for a disk that is slow.
     """
-    late = _LATE.get(place)
-    if late is None or late.made.done():
-        others = any(not each.made.done() for each in list(_LATE.values()))
-        late = _Late([first])
-        thread = Thread(target=late.run, args=[read], daemon=True)
-        thread.start()
-        thread.join(SHORT_SECONDS if others else SILENT_SECONDS)
-        if late.made.done():
-            return late.made.result(), False
-        _LATE[place] = late
-        late.is_slow()
-        thread.join(SHORT_SECONDS)
-    is_slow = late.is_slow()
-    while is_slow and is_patient and not late.made.done():
-        time.sleep(SHORT_SECONDS)
-        is_slow = late.is_slow()
-    if late.made.done():
-        return late.made.result(), False
-    return late.known[-1], not is_slow
+    with _LOCK:
+        is_short = any(each.is_silent() for each in _LATE.values())
+        late = _LATE.get(place)
+        if late is None:
+            late = _Late([first])
+            threading.Thread(target=late.run, args=[read], daemon=True).start()
+            _LATE[place] = late
+    seconds = SHORT_SECONDS if is_short else SILENT_SECONDS
+    end = math.inf if is_patient else time.monotonic() + seconds
+    while not (is_silent := late.is_silent()) and time.monotonic() < end:
+        if wait([late.made], SHORT_SECONDS).done:
+            break
+    if not late.made.done():
+        return late.known[-1], is_silent
+    with _LOCK:
+        if _LATE.get(place) is late:
+            del _LATE[place]
+    return late.made.result(), False
 
 
 def clock_of_this_thread() -> Callable[[], float]:

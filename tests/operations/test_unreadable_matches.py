@@ -125,6 +125,42 @@ def test_a_slow_disk_of_a_match_is_not_called_silent(two, monkeypatch):
     assert read_summary(store, "first") == kept  # after the last answer
 
 
+@pytest.fixture
+def short(monkeypatch):
+    """Short times for the patience with disks, and the reads of this test alone."""
+    monkeypatch.setattr(patience, "SILENT_SECONDS", 0.5)
+    monkeypatch.setattr(patience, "SHORT_SECONDS", 0.1)
+    monkeypatch.setattr(patience, "_LATE", {})
+
+
+def _answers(number, seconds=0.1):
+    def read(known):
+        for _ in range(number):
+            time.sleep(seconds)
+        return "found"
+
+    return read
+
+
+def test_a_read_that_ends_between_two_calls_is_not_lost(short):
+    read = _answers(8)
+    assert patience.read_in_time("m", read, "first", is_patient=False) == ("first", False)
+    time.sleep(0.6)
+    assert patience.read_in_time("m", None, "first", is_patient=False) == ("found", False)
+    assert patience._LATE == {}  # the next one reads again
+
+
+def test_only_the_impatient_wait_for_a_shorter_time_beside_a_silent_disk(short):
+    never = Event()
+    dead = patience.read_in_time("dead", lambda _: never.wait(), "first", is_patient=True)
+    assert dead == ("first", True)
+    assert patience.read_in_time("a", _answers(1, 0.3), "", is_patient=True) == ("found", False)
+    begun = time.monotonic()
+    assert patience.read_in_time("b", _answers(9), "first", is_patient=False) == ("first", False)
+    assert time.monotonic() - begun < 0.4
+    never.set()
+
+
 @pytest.mark.timeout(120)
 def test_a_silent_disk_of_a_match_is_an_alert_that_names_it(silent, two, monkeypatch):
     steps, state = {}, two / "operations"
