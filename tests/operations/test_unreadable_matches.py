@@ -14,9 +14,12 @@ from command_line import worldpose
 from page_client import log_in, served
 from service import wait_until
 
-from flows import patience
+from data_contracts.operations import MatchSummary
+from flows import patience, reprocess
 from flows.overview import Overview, read_summary
 from flows.registering import register
+from flows.results import best_results
+from flows.running import RunRequest
 from flows.service import watching
 from flows.service.alerts import AlertDispatcher, kept_alerts
 from flows.service.plan import ServePlan
@@ -159,6 +162,17 @@ def test_only_the_impatient_wait_for_a_shorter_time_beside_a_silent_disk(short):
     assert patience.read_in_time("b", _answers(9), "first", is_patient=False) == ("first", False)
     assert time.monotonic() - begun < 0.4
     never.set()
+
+
+def test_results_of_a_match_on_a_silent_disk_are_not_called_current(two, monkeypatch):
+    store = Store.open(two / "project")
+    seen = MatchSummary(match_id="first", is_silent=True, is_settled=True, problem="no answer yet")
+    monkeypatch.setattr(reprocess, "read_summary", lambda *_: seen)
+    monkeypatch.setattr(best_results, "read_summary", lambda *_: seen)
+    monkeypatch.setattr(best_results, "describe_later", lambda *_: "")
+    (found,) = reprocess.reprocess_matches(store, ["first"], RunRequest({}))
+    assert (found.state, found.problem) == ("failed", "no answer yet")
+    assert best_results.describe_age(store, SimpleNamespace(match_id="first")) == "no answer yet"
 
 
 @pytest.mark.timeout(120)
