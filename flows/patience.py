@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections.abc import Callable
@@ -17,12 +16,14 @@ SILENT_SECONDS: Final = 10.0
 """A disk that has not answered for so long is silent."""
 SHORT_SECONDS: Final = 1.0
 """Wait of the impatient while another disk is silent: many matches can be on it."""
+MOST_SILENT: Final = 64  # then the impatient begin no other read
 
 
 @dataclass
 class _Late(Generic[T]):
     """A read in a thread of its own."""
 
+    mark: object
     known: list[T]
     """What it has found, the best last."""
     made: Future[T] = field(default_factory=Future)
@@ -41,44 +42,45 @@ class _Late(Generic[T]):
     def is_silent(self) -> bool:
         """Return whether its disk has not answered for `SILENT_SECONDS`, as far as was looked."""
         with suppress(OSError):  # the thread has just ended
-            spent = 0.0 if self.clock is None else self.clock()
-            if spent != self.spent:
+            if self.clock is not None and self.spent != (spent := self.clock()):
                 self.spent, self.moved_at = spent, time.monotonic()
         return not self.made.done() and time.monotonic() - self.moved_at >= SILENT_SECONDS
 
 
-_LATE: Final[dict[object, _Late[Any]]] = {}
+LATE: Final[dict[str, _Late[Any]]] = {}
 _LOCK: Final = threading.Lock()
 
 
 def read_in_time(
-    place: object, read: Callable[[list[T]], T], first: T, *, is_patient: bool
+    place: str, mark: object, read: Callable[[list[T]], T], first: T, *, is_patient: bool
 ) -> tuple[T, bool]:
     """Return what a read gives, or else the best that it has found, and whether its disk is silent.
 
     Args:
-        place: what is read; of two reads of it, a second one does not begin while one is late.
+        place: what is read; only one read of it at a time is at work.
+        mark: of its state; a read that began before another one is not of this state.
         read: gets a list to which it adds what it finds on the way.
         first: what is known before.
-        is_patient: wait for a disk that is slow.
+        is_patient: wait for a slow disk.
     """
     with _LOCK:
-        is_short = any(each.is_silent() for each in _LATE.values())
-        late = _LATE.get(place)
-        if late is None:
-            late = _Late([first])
+        silent = sum(each.is_silent() for each in LATE.values())
+        if (late := LATE.get(place)) is None:
+            if silent >= MOST_SILENT and not is_patient:
+                return first, False
+            late = _Late(mark, [first])
             threading.Thread(target=late.run, args=[read], daemon=True).start()
-            _LATE[place] = late
-    seconds = SHORT_SECONDS if is_short else SILENT_SECONDS
-    end = math.inf if is_patient else time.monotonic() + seconds
-    while not (is_silent := late.is_silent()) and time.monotonic() < end:
-        if wait([late.made], SHORT_SECONDS).done:
-            break
+            LATE[place] = late
+    end = time.monotonic() + (SHORT_SECONDS if silent else SILENT_SECONDS)
+    while not late.made.done() and not late.is_silent() and (is_patient or time.monotonic() < end):
+        wait([late.made], SHORT_SECONDS)
     if not late.made.done():
-        return late.known[-1], is_silent
+        return late.known[-1], late.is_silent()
     with _LOCK:
-        if _LATE.get(place) is late:
-            del _LATE[place]
+        if LATE.get(place) is late:
+            del LATE[place]
+    if late.mark != mark:
+        return read_in_time(place, mark, read, first, is_patient=is_patient)
     return late.made.result(), False
 
 
