@@ -16,15 +16,17 @@ from page_client import log_in, served
 from service import wait_until
 
 from data_contracts.operations import MatchSummary, QueuedRun
-from flows import patience, reprocess
+from flows import patience, reprocess, running
+from flows.layers import SETTINGS_LOCK, read_layers
 from flows.overview import Overview, read_summary
-from flows.registering import register
+from flows.registering import open_match, register
 from flows.results import best_results
 from flows.running import RunRequest
 from flows.service import watching
 from flows.service.alerts import AlertDispatcher, kept_alerts
 from flows.service.plan import ServePlan
 from worldpose.store.run_queue import queue_of
+from worldpose.store.runs import alone
 from worldpose.store.store import Store
 
 
@@ -203,6 +205,19 @@ def test_results_of_a_match_on_a_silent_disk_are_not_called_current(two, monkeyp
     (found,) = reprocess.reprocess_matches(store, ["first"], RunRequest({}))
     assert (found.state, found.problem) == ("failed", "no answer yet")
     assert best_results.describe_age(store, SimpleNamespace(match_id="first")) == "no answer yet"
+
+
+def test_no_lock_is_held_while_a_disk_is_asked_for_files_of_settings(two, monkeypatch):
+    store, free = Store.open(two / "project"), []
+
+    def ask(*_):
+        with alone(store.blobs, SETTINGS_LOCK, wait=False) as is_free:
+            free.append(is_free)
+
+    monkeypatch.setattr(running, "_require_usable", ask)
+    running.settle(store, open_match(store, "first"), RunRequest({}, iterations=2))
+    assert free == [True]
+    assert read_layers(store, store.registration("first").spec)[-1].values == {"iterations": 2}
 
 
 @pytest.mark.timeout(120)
