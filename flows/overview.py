@@ -75,7 +75,8 @@ def read_summary(store: Store, match_id: str, *, is_patient: bool = True) -> Mat
     """
     unseen = MatchSummary(match_id=match_id, is_unseen=True)
     found, is_silent = read_in_time(
-        (store.url, match_id),
+        f"match {match_id} of {store.url}",
+        store.blobs.marks([registration_path(match_id), *_own(match_id)]),
         lambda known: _read_summary(store, match_id, known),
         unseen,
         is_patient=is_patient,

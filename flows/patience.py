@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from contextlib import suppress
 from dataclasses import dataclass, field
-from threading import Thread
 from typing import Any, Final, Generic, TypeVar
 
 T = TypeVar("T")
@@ -17,20 +15,22 @@ T = TypeVar("T")
 SILENT_SECONDS: Final = 10.0
 """A disk that has not answered for so long is silent."""
 SHORT_SECONDS: Final = 1.0
-"""The same while another read is late: many matches can be on one silent disk."""
+"""Wait of the impatient while another disk is silent: many matches can be on it."""
+MOST_SILENT: Final = 64  # then the impatient begin no other read
 
 
 @dataclass
 class _Late(Generic[T]):
     """A read in a thread of its own."""
 
+    mark: object
     known: list[T]
     """What it has found, the best last."""
     made: Future[T] = field(default_factory=Future)
     clock: Callable[[], float] | None = None
     """Processor time of its thread [s]: it stands still while the disk does not answer."""
-    spent: float = -1.0
-    moved_at: float = -math.inf
+    spent: float = 0.0
+    moved_at: float = field(default_factory=time.monotonic)
 
     def run(self, read: Callable[[list[T]], T]) -> None:
         self.clock = clock_of_this_thread()
@@ -39,49 +39,49 @@ class _Late(Generic[T]):
         except Exception as error:
             self.made.set_exception(error)
 
-    def is_slow(self) -> bool:
-        """Return whether the disk has answered since the last call, or within `SILENT_SECONDS`."""
+    def is_silent(self) -> bool:
+        """Return whether its disk has not answered for `SILENT_SECONDS`, as far as was looked."""
         with suppress(OSError):  # the thread has just ended
-            spent = 0.0 if self.clock is None else self.clock()
-            if spent != self.spent >= 0.0:
-                self.moved_at = time.monotonic()
-            self.spent = spent
-        return time.monotonic() - self.moved_at < SILENT_SECONDS
+            if self.clock is not None and self.spent != (spent := self.clock()):
+                self.spent, self.moved_at = spent, time.monotonic()
+        return not self.made.done() and time.monotonic() - self.moved_at >= SILENT_SECONDS
 
 
-_LATE: Final[dict[object, _Late[Any]]] = {}
+LATE: Final[dict[str, _Late[Any]]] = {}
+_LOCK: Final = threading.Lock()
 
 
 def read_in_time(
-    place: object, read: Callable[[list[T]], T], first: T, *, is_patient: bool
+    place: str, mark: object, read: Callable[[list[T]], T], first: T, *, is_patient: bool
 ) -> tuple[T, bool]:
     """Return what a read gives, or else the best that it has found, and whether its disk is silent.
 
     Args:
-        place: what is read; of two reads of it, a second one does not begin while one is late.
+        place: what is read; only one read of it at a time is at work.
+        mark: of its state; a read that began before another one is not of this state.
         read: gets a list to which it adds what it finds on the way.
         first: what is known before.
-        is_patient: wait for a disk that is slow.
+        is_patient: wait for a slow disk.
     """
-    late = _LATE.get(place)
-    if late is None or late.made.done():
-        others = any(not each.made.done() for each in list(_LATE.values()))
-        late = _Late([first])
-        thread = Thread(target=late.run, args=[read], daemon=True)
-        thread.start()
-        thread.join(SHORT_SECONDS if others else SILENT_SECONDS)
-        if late.made.done():
-            return late.made.result(), False
-        _LATE[place] = late
-        late.is_slow()
-        thread.join(SHORT_SECONDS)
-    is_slow = late.is_slow()
-    while is_slow and is_patient and not late.made.done():
-        time.sleep(SHORT_SECONDS)
-        is_slow = late.is_slow()
-    if late.made.done():
-        return late.made.result(), False
-    return late.known[-1], not is_slow
+    with _LOCK:
+        silent = sum(each.is_silent() for each in LATE.values())
+        if (late := LATE.get(place)) is None:
+            if silent >= MOST_SILENT and not is_patient:
+                return first, False
+            late = _Late(mark, [first])
+            threading.Thread(target=late.run, args=[read], daemon=True).start()
+            LATE[place] = late
+    end = time.monotonic() + (SHORT_SECONDS if silent else SILENT_SECONDS)
+    while not late.made.done() and not late.is_silent() and (is_patient or time.monotonic() < end):
+        wait([late.made], SHORT_SECONDS)
+    if not late.made.done():
+        return late.known[-1], late.is_silent()
+    with _LOCK:
+        if LATE.get(place) is late:
+            del LATE[place]
+    if late.mark != mark:
+        return read_in_time(place, mark, read, first, is_patient=is_patient)
+    return late.made.result(), False
 
 
 def clock_of_this_thread() -> Callable[[], float]:

@@ -78,6 +78,8 @@ def _reprocess(
         if not request.settings:
             found = read_summary(store, match_id)  # as cheap as it is exact
             latest, failed = found.latest, bool(found.latest and found.latest.failed)
+            if found.is_silent:
+                return Reprocessed(match_id, "failed", problem=found.problem)
             if found.is_settled and not (retry and failed):
                 return Reprocessed(match_id, "current" if latest else "never run", record=latest)
         with nullcontext() if is_rehearsal else alone_with(store, match_id):

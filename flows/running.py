@@ -140,20 +140,27 @@ def settle(store: Store, match: Match, request: RunRequest) -> tuple[Match, RunR
     stated = flatten(request.settings)
     stated |= {} if request.iterations is None else {"iterations": request.iterations}
     stated |= {} if request.body_folder is None else {"body_folder": request.body_folder}
-    with alone(store.blobs, SETTINGS_LOCK, wait=True):
-        *others, own = read_layers(store, match.registration.spec)  # it can have changed since
-        check_general(own.name, "the request", stated)
-        values = {**_kept_values(own, request), **stated}
-        found = resolve([*others, replace(own, values=values)])
-        folder = found.origins.get("body_folder")
-        if folder is not None and folder.name == ENVIRONMENT and _needs_bodies(found):
-            # Another shell, or the service, may not have the variable.
-            values["body_folder"] = folder.values["body_folder"]
-        settled = replace(match, layers=(*others, replace(own, values=values)))
-        if values != own.values:
-            _require_usable(settled, request, found.overrides)  # else the value is not kept
-            write_layer(store, own.name, values)
-            _report_lost(own, values)
+    checked: tuple[Layer, ...] | None = None
+    while True:
+        with alone(store.blobs, SETTINGS_LOCK, wait=True):
+            *others, own = read_layers(store, match.registration.spec)  # it can have changed since
+            check_general(own.name, "the request", stated)
+            values = {**_kept_values(own, request), **stated}
+            found = resolve([*others, replace(own, values=values)])
+            folder = found.origins.get("body_folder")
+            if folder is not None and folder.name == ENVIRONMENT and _needs_bodies(found):
+                # Another shell, or the service, may not have the variable.
+                values["body_folder"] = folder.values["body_folder"]
+            settled = replace(match, layers=(*others, replace(own, values=values)))
+            if values == own.values:
+                break
+            if settled.layers == checked:
+                write_layer(store, own.name, values)
+                _report_lost(own, values)
+                break
+        # Not while the lock is held: a disk of what it reads may not answer. Else nothing is kept.
+        _require_usable(settled, request, found.overrides)
+        checked = settled.layers
     _report_settings(found, {*stated}, latest_run(store, match.match_id))
     return settled, replace(
         request,

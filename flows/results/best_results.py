@@ -123,6 +123,8 @@ def describe_age(store: Store, record: RunRecord) -> str:
     if later := describe_later(store, record):
         return later
     now = read_summary(store, record.match_id)
+    if now.is_silent:
+        return now.problem
     if now.kind == "outdated":
         return f"These results are {now.words}. {now.todo}"
     # Open questions or a run at work say nothing about the results that are there.

@@ -82,6 +82,7 @@ def adopt_due(runs: MatchRuns) -> None:
     Of runs that a schedule missed, the last one with the same parameters stands for all; what a
     deployment decides does not count.
     """
+    known = {run.flow_run: run for run in runs.queue.runs()}  # first: what is due can end meanwhile
     kinds = of_types("SCHEDULED", "PENDING", "RUNNING")
     passed = {"before_": datetime.now(UTC).isoformat()}
     due = runs.runs(deployment_names(runs.name), state=kinds, expected_start_time=passed)
@@ -97,7 +98,6 @@ def adopt_due(runs: MatchRuns) -> None:
             last[same] = run
         else:
             last[run["id"]] = run
-    known = {run.flow_run: run for run in runs.queue.runs()}
     for run in last.values():
         ended = known.get(run["id"])
         if ended is None:
@@ -151,7 +151,7 @@ def _recover(
     own = plan.model_dump(mode="json")
     is_former = there is not None and not is_over and there["parameters"].get("plan", own) != own
     has_run = killed.state != "killed" and there is not None and not is_over and not is_former
-    if has_run and not _is_stuck(killed, there, patience):
+    if has_run and not _is_stuck(killed, there, patience, has_our_clock=plan.owns_prefect):
         return False
     _start_again(runs, killed, there, is_former)
     return True
@@ -179,7 +179,9 @@ def _start_again(
         )
 
 
-def _is_stuck(run: QueuedRun, there: PrefectRun | None, patience: timedelta) -> bool:
+def _is_stuck(
+    run: QueuedRun, there: PrefectRun | None, patience: timedelta, *, has_our_clock: bool
+) -> bool:
     """Return whether a queued run cannot begin.
 
     A run stays in a starting state if its process was killed while the server was not reachable or
@@ -193,8 +195,9 @@ def _is_stuck(run: QueuedRun, there: PrefectRun | None, patience: timedelta) -> 
         return bool(due) and parse_time(due) > now + SOON
     pid = str(there["infrastructure_pid"] or "")
     has_process = pid.isdigit() and is_alive(int(pid))
-    # A clock that was set back makes the time one to come.
-    return not has_process and abs(now - parse_time(there["state"]["timestamp"])) > patience
+    age = now - parse_time(there["state"]["timestamp"])
+    # A clock that was set back makes the time one to come; so does that of another machine.
+    return not has_process and (abs(age) if has_our_clock else age) > patience
 
 
 @dataclass

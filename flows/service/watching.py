@@ -8,12 +8,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
-from pathlib import Path
 from threading import Thread
 from typing import Final
 
 from flows.overview import Overview, is_late
-from flows.patience import SILENT_SECONDS, clock_of_this_thread
+from flows.patience import LATE, clock_of_this_thread
 from flows.service.alerts import Alert, AlertDispatcher, alerts_now
 from flows.service.channels import Channel, channels_of
 from flows.service.inbox import watch_once
@@ -21,7 +20,6 @@ from flows.service.match_runs import MatchRuns
 from flows.service.metrics import MAX_SCRAPES, ProjectMetrics, metrics_app
 from flows.service.plan import METRICS_TOKEN, ServePlan
 from flows.service.recovery import Liveness, recover
-from flows.service.run_queue import ask_disk
 from flows.web.http_server import serve_http
 from worldpose.store.run_queue import ENDED, queue_of
 from worldpose.store.store import Store
@@ -162,27 +160,13 @@ def _hold_alerts(
         while is_late(matches := overview.look(LOOK_SECONDS)) and time.monotonic() < end:
             time.sleep(0.1)
         arrivals = plan.state_folder.arrivals().values()
-        found = alerts_now(plan, matches, arrivals, queue.runs())
-        unread = {each.match_id for each in matches if each.is_unseen}
-        for each in matches:
-            if each.is_silent and (known := overview.store.registration(each.match_id)):
-                _ask_disk(Path(known.folder))
+        unread = {each.match_id for each in matches if each.is_unseen or each.is_silent}
+        blind = unread - {each.match_id for each in matches if each.latest is not None}
+        runs = [run for run in queue.runs() if run.state not in ENDED or run.match_id not in blind]
+        found = alerts_now(plan, matches, arrivals, runs)
         dispatcher.hold([*found, *liveness.alerts], unread=unread)
 
     return hold
-
-
-def _ask_disk(folder: Path) -> None:
-    """Begin a step that ends when the disk of a silent match answers; a slow one does."""
-    what = f"looking at {folder}"
-
-    def ask() -> None:
-        ask_disk(folder)
-        STEPS.pop(what)
-
-    if what not in STEPS:
-        STEPS[what] = time.monotonic() - SILENT_SECONDS
-        Thread(target=ask, name=what, daemon=True).start()
 
 
 def _watch_steps(plan: ServePlan, dispatcher: AlertDispatcher) -> None:
@@ -194,6 +178,9 @@ def _watch_steps(plan: ServePlan, dispatcher: AlertDispatcher) -> None:
             _MOVED[what] = spent, now
         if now - max(began, _MOVED[what][1]) > limit and what != BUCKET:
             late.append(what)
+    for place, read in list(LATE.items()):
+        if read.is_silent() and now - read.moved_at > limit:
+            late.append(f"looking at {place}")
     text = f"{', '.join(late)}: no progress in {plan.stall_minutes:g} min; does a disk not answer?"
     alert = Alert("watch_stalled", "watch_stalled", text, f"{plan.pages}/status")
     dispatcher.hold([alert] if late else [], source="steps")

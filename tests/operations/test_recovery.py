@@ -299,15 +299,31 @@ def test_a_step_of_the_clock_is_an_alert_for_a_day(queue, plan, hours, how):
 def test_a_run_that_cannot_begin_is_found_whatever_became_of_the_clock(queue, hours):
     run, now, step = queue.take(a_run()), datetime.now(UTC), timedelta(hours=hours)
 
-    def is_stuck(kind, *, due=None, since=now):
+    def is_stuck(kind, *, due=None, since=now, has_our_clock=True):
         there = {"state_type": kind, "infrastructure_pid": None}
         there |= {"next_scheduled_start_time": due and due.isoformat()}
         there |= {"state": {"timestamp": since.isoformat()}}
-        return recovery._is_stuck(run, there, recovery.STARTING)
+        return recovery._is_stuck(run, there, recovery.STARTING, has_our_clock=has_our_clock)
 
     assert is_stuck("SCHEDULED", due=now + step) == (hours > 0)  # else the worker takes it now
     assert is_stuck("PENDING", since=now + step)
+    # The clock of another machine can be ahead.
+    assert is_stuck("PENDING", since=now + step, has_our_clock=False) == (hours < 0)
     assert not is_stuck("PENDING", since=now - timedelta(minutes=1))
+
+
+def test_a_run_that_ends_while_prefect_answers_is_not_retried(queue):
+    run = queue.take(a_run())
+    queue.change(run, "begun")
+    at = datetime.now(UTC) + timedelta(minutes=1)  # it was scheduled again while it ran
+
+    def answer(*_, **__):
+        queue.change(queue.latest(run), "complete")
+        there = {"id": run.flow_run, "tags": [], "state_type": "SCHEDULED"}
+        return [{**there, "expected_start_time": str(at), "state": {"timestamp": at.isoformat()}}]
+
+    recovery.adopt_due(SimpleNamespace(name="n", queue=queue, runs=answer))
+    assert queue.latest(run).state == "complete"
 
 
 def test_a_step_of_the_watcher_that_does_not_end_is_an_alert(plan, monkeypatch):

@@ -5,8 +5,9 @@ import os
 import re
 import shutil
 import time
+from datetime import UTC, datetime
 from pathlib import Path
-from threading import Event
+from threading import Event, active_count
 from types import SimpleNamespace
 
 import pytest
@@ -14,12 +15,18 @@ from command_line import worldpose
 from page_client import log_in, served
 from service import wait_until
 
-from flows import patience
+from data_contracts.operations import MatchSummary, QueuedRun
+from flows import patience, reprocess, running
+from flows.layers import SETTINGS_LOCK, read_layers
 from flows.overview import Overview, read_summary
-from flows.registering import register
+from flows.registering import open_match, register
+from flows.results import best_results
+from flows.running import RunRequest
 from flows.service import watching
 from flows.service.alerts import AlertDispatcher, kept_alerts
 from flows.service.plan import ServePlan
+from worldpose.store.run_queue import queue_of
+from worldpose.store.runs import alone
 from worldpose.store.store import Store
 
 
@@ -125,25 +132,121 @@ def test_a_slow_disk_of_a_match_is_not_called_silent(two, monkeypatch):
     assert read_summary(store, "first") == kept  # after the last answer
 
 
+@pytest.fixture
+def short(monkeypatch):
+    """Short times for the patience with disks, and the reads of this test alone."""
+    monkeypatch.setattr(patience, "SILENT_SECONDS", 0.5)
+    monkeypatch.setattr(patience, "SHORT_SECONDS", 0.1)
+    monkeypatch.setattr(patience, "LATE", {})
+
+
+def _answers(number, seconds=0.1):
+    def read(known):
+        for _ in range(number):
+            time.sleep(seconds)
+        return "found"
+
+    return read
+
+
+def test_a_read_that_ends_between_two_calls_is_not_lost(short):
+    read = _answers(8)
+    assert patience.read_in_time("m", 0, read, "first", is_patient=False) == ("first", False)
+    time.sleep(0.6)
+    assert patience.read_in_time("m", 0, None, "first", is_patient=False) == ("found", False)
+    assert patience.LATE == {}  # the next one reads again
+
+
+def test_a_read_that_began_before_a_decision_does_not_answer_after_it(short):
+    decided, wait = [], _answers(8)
+
+    def read(known):
+        return len(decided), wait(known)
+
+    assert patience.read_in_time("m", 0, read, "first", is_patient=False) == ("first", False)
+    decided.append("yes")
+    found = patience.read_in_time("m", 1, read, "first", is_patient=True)
+    assert found == ((1, "found"), False)
+
+
+def test_no_more_reads_begin_while_many_are_silent(short, monkeypatch):
+    monkeypatch.setattr(patience, "MOST_SILENT", 2)
+    never = Event()
+
+    def read(place):
+        return patience.read_in_time(place, 0, lambda _: never.wait(), place, is_patient=False)
+
+    assert [read("a"), read("b")] == [("a", True), ("b", False)]
+    time.sleep(0.6)
+    assert read("b") == ("b", True)
+    before = active_count()
+    assert read("c") == ("c", False) and active_count() == before
+    never.set()
+    wait_until(lambda: read("c") == (True, False))
+
+
+def test_only_the_impatient_wait_for_a_shorter_time_beside_a_silent_disk(short):
+    never = Event()
+    dead = patience.read_in_time("dead", 0, lambda _: never.wait(), "first", is_patient=True)
+    assert dead == ("first", True)
+    assert patience.read_in_time("a", 0, _answers(1, 0.3), "", is_patient=True) == ("found", False)
+    begun = time.monotonic()
+    assert patience.read_in_time("b", 0, _answers(9), "first", is_patient=False) == ("first", False)
+    assert time.monotonic() - begun < 0.4
+    never.set()
+
+
+def test_results_of_a_match_on_a_silent_disk_are_not_called_current(two, monkeypatch):
+    store = Store.open(two / "project")
+    seen = MatchSummary(match_id="first", is_silent=True, is_settled=True, problem="no answer yet")
+    monkeypatch.setattr(reprocess, "read_summary", lambda *_: seen)
+    monkeypatch.setattr(best_results, "read_summary", lambda *_: seen)
+    monkeypatch.setattr(best_results, "describe_later", lambda *_: "")
+    (found,) = reprocess.reprocess_matches(store, ["first"], RunRequest({}))
+    assert (found.state, found.problem) == ("failed", "no answer yet")
+    assert best_results.describe_age(store, SimpleNamespace(match_id="first")) == "no answer yet"
+
+
+def test_no_lock_is_held_while_a_disk_is_asked_for_files_of_settings(two, monkeypatch):
+    store, free = Store.open(two / "project"), []
+
+    def ask(*_):
+        with alone(store.blobs, SETTINGS_LOCK, wait=False) as is_free:
+            free.append(is_free)
+
+    monkeypatch.setattr(running, "_require_usable", ask)
+    running.settle(store, open_match(store, "first"), RunRequest({}, iterations=2))
+    assert free == [True]
+    assert read_layers(store, store.registration("first").spec)[-1].values == {"iterations": 2}
+
+
 @pytest.mark.timeout(120)
 def test_a_silent_disk_of_a_match_is_an_alert_that_names_it(silent, two, monkeypatch):
-    steps, state = {}, two / "operations"
-    monkeypatch.setattr(watching, "STEPS", steps)
+    state, queue = two / "operations", queue_of(str(two / "project"))
     state.mkdir()
     more = {"prefect": "http://127.0.0.1:9/api", "stall_minutes": 10, "disk_gb": 0.0}
     plan = ServePlan(project=str(two / "project"), inbox=two, state=state, **more)
     dispatcher, seen = AlertDispatcher(plan.state_folder, []), Overview(Store.open(two / "project"))
+    now = datetime.now(UTC)
+    times = {"asked_at": now, "changed_at": now}
+    run = QueuedRun(id="1", flow="match", name="r", match_id="first", flow_run="1", **times)
+    queue.take(run.model_copy(update={"state": "failed"}))
+    held, hold = [], dispatcher.hold
+    monkeypatch.setattr(dispatcher, "hold", lambda *a, **b: (held.append((a, b)), hold(*a, **b)))
     watching._hold_alerts(plan, seen, dispatcher, SimpleNamespace(alerts=[]))()
-    (what,) = steps
-    assert what == f"looking at {two / 'first'}"
+    # Without a kept summary, nothing says whether a later run succeeded.
+    assert held == [(([],), {"unread": {"first"}})]
     watching._watch_steps(plan, dispatcher)
     assert kept_alerts(plan.state_folder) == {}
-    steps[what] -= 600.0
+    read = patience.LATE[place := f"match first of {two / 'project'}"]
+    read.moved_at -= 601.0
     watching._watch_steps(plan, dispatcher)
     (alert,) = kept_alerts(plan.state_folder).values()
-    assert f"{what}: no progress in 10 min" in alert["text"]
+    assert f"looking at {place}: no progress in 10 min" in alert["text"]
     silent()
-    wait_until(lambda: not steps)
+    wait_until(read.made.done)
+    watching._watch_steps(plan, dispatcher)
+    assert kept_alerts(plan.state_folder) == {}
 
 
 @pytest.mark.parametrize("record", ["runs/first/0001.json", "matches/first.json"])

@@ -133,18 +133,29 @@ def alone(blobs: Blobs, what: str, *, wait: bool) -> Iterator[bool]:
 
 
 @contextmanager
-def hold_lock(file: Path, *, wait: bool) -> Iterator[bool]:
+def hold_lock(file: Path, *, wait: bool, most_seconds: float = 600.0) -> Iterator[bool]:
     """Hold the lock of a file; yield whether it was acquired, which can fail without `wait`.
 
     The operating system releases the lock when the process ends, however it ends. The parent of the
     lock's folder must exist, and not be empty: there a project's disk may not be mounted.
+
+    Raises:
+        InputError: another process has held it for `most_seconds` of waiting.
     """
+    end = time.monotonic() + most_seconds
     if not file.parent.exists() and any(file.parent.parent.iterdir()):
         file.parent.mkdir(exist_ok=True)
     is_of_other = file.exists() and not os.access(file, os.W_OK)  # another user's
     with file.open("r" if is_of_other else "a") as lock:
         while not (is_held := _try_lock(lock)) and wait:
             time.sleep(0.05)  # unlike one long wait, it shows that this process is well
+            if time.monotonic() > end:
+                raise InputError(
+                    str(file),
+                    expected=f"a lock that is free within {most_seconds / 60.0:g} min",
+                    found="another process that holds it",
+                    todo="Look after its disk, or end that process; then try again.",
+                )
         yield is_held
 
 

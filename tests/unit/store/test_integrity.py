@@ -26,7 +26,7 @@ from worldpose.store.documents import canonical_json, digest, seal
 from worldpose.store.garbage import collect, plan_gc
 from worldpose.store.integrity import repair, verify
 from worldpose.store.paths import ResultId
-from worldpose.store.runs import alone, list_pins, may_be_running, pin_run, unpin_run
+from worldpose.store.runs import alone, hold_lock, list_pins, may_be_running, pin_run, unpin_run
 from worldpose.store.store import Store, open_run
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
@@ -227,6 +227,14 @@ def test_a_lock_excludes_other_processes_and_ends_with_its_process(folder_store)
     locks.write_text("")  # as on a disk without locks
     with alone(blobs, "a", wait=False) as is_held, alone(blobs, "a", wait=False) as is_second:
         assert (is_held, is_second) == (True, False)
+
+
+def test_a_wait_for_a_lock_ends_with_the_name_of_its_file(tmp_path):
+    (tmp_path / "project.json").touch()
+    file = tmp_path / "a.lock"
+    with hold_lock(file, wait=True), pytest.raises(InputError, match=r"a\.lock: expected a lock"):  # noqa: SIM117
+        with hold_lock(file, wait=True, most_seconds=0.2):
+            pass
 
 
 def test_processes_get_different_numbers(store):
