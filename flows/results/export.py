@@ -92,9 +92,8 @@ def export_worldpose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     errors: dict[str, dict[str, str | float | None]] = {}
     for name, camera in cameras.items():
         if camera.lens_model != LensModel.BROWN:
-            kind = LensModel(int(camera.lens_model)).label
-            cameras[name], told = fit_brown_lens(camera, f"--format worldpose: {name}")
-            errors[name] = {"lens_model": kind, **told}
+            cameras[name], off = fit_brown_lens(camera, f"--format worldpose: {name}")
+            errors[name] = {"lens_model": LensModel(int(camera.lens_model)).label, **off}
     for clip in best_results.all_clips(origin.run):
         if clip in with_people:
             model, poses, _ = best_results.fitted_bodies(origin.run, clip)
