@@ -113,7 +113,7 @@ def _require_pixels(found: list[MarkedImage], *, per_cent: bool) -> None:
     all_own = np.concatenate(own)
     low, top = all_own.min(initial=np.inf), all_own.max(initial=-np.inf)
     is_share = top <= (1.1 if per_cent else 1.1 + CORNER)
-    is_per_cent = not per_cent and smallest > 200 and 50.0 < top <= 110.0
+    is_per_cent = not per_cent and smallest > 200 and 50.0 < top <= 100.0 + CORNER
     if len(all_own) > 1 and low > -0.1 and (is_share or is_per_cent):
         raise ContentError(f"places of {low:.3g} to {top:.3g} in all images: in another unit?")
 
