@@ -73,7 +73,7 @@ class PageContext:
             raise HTTPException(404, "no such match")
         return found
 
-    def _readable(self, name: str) -> str:
+    def readable(self, name: str) -> str:
         """Return the id of a registered match; many requests to a silent disk block all pages.
 
         Raises:
@@ -88,17 +88,17 @@ class PageContext:
         """Return a registered match with its current corrections.
 
         Raises:
-            HTTPException: as `_readable`.
+            HTTPException: as `readable`.
         """
-        return open_for_review(self.store, self._readable(name))
+        return open_for_review(self.store, self.readable(name))
 
     def stored_match(self, name: str) -> Match:
         """Return a match to show its results, also while its folder is away.
 
         Raises:
-            HTTPException: as `_readable`.
+            HTTPException: as `readable`.
         """
-        return open_stored(self.store, self._readable(name))
+        return open_stored(self.store, self.readable(name))
 
     def review(self, name: str, request: str) -> tuple[Match, ReviewRequest]:
         """Return a match and one of its review requests.

@@ -144,11 +144,11 @@ def _begin(drafts: Drafts, intake: Intake, context: PageContext, who: str, given
     """Create a draft; return its id.
 
     Raises:
-        HTTPException: 404, there is no such match.
+        HTTPException: 404, there is no such match; 503, its disk does not answer.
         InputError: the arrival cannot be corrected on a page.
     """
     if given.match is not None:
-        return drafts.create(who, context.registration(given.match).spec.match_id).id
+        return drafts.create(who, context.readable(given.match)).id
     if given.arrival is None:
         return drafts.create(who).id
     entry, arrival = find_refused(served_state(context.store.url), intake.inbox, given.arrival)

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 from command_line import worldpose
+from fastapi import HTTPException
 from page_client import log_in, served
 from service import wait_until
 
@@ -25,6 +26,10 @@ from flows.running import RunRequest
 from flows.service import watching
 from flows.service.alerts import AlertDispatcher, kept_alerts
 from flows.service.plan import ServePlan
+from flows.web import intake
+from flows.web.app_context import PageContext
+from flows.web.drafts import Drafts
+from flows.web.intake import NewDraft
 from worldpose.store.run_queue import queue_of
 from worldpose.store.runs import alone
 from worldpose.store.store import Store
@@ -107,6 +112,9 @@ def test_requests_that_wait_for_a_silent_disk_leave_the_pages_to_others(silent, 
     for _ in range(50):  # more than the server has threads
         assert "no answer yet" in browser.get("/status").text
         assert browser.get("/api/matches/first").status_code == 503
+    context = PageContext(Store.open(two / "project"), None)
+    with pytest.raises(HTTPException, match="no answer yet"):
+        intake._begin(Drafts(two, (), context.store), None, context, "Ada", NewDraft(match="first"))
     assert browser.get("/api/matches/second").status_code == 200
     silent()
     wait_until(lambda: browser.get("/api/matches/first").status_code == 200)
