@@ -87,7 +87,7 @@ def read_summary(store: Store, match_id: str, *, is_patient: bool = True) -> Mat
         f"match {match_id}",
         expected="a disk of its folder that answers",
         found=f"no answer yet after {SILENT_SECONDS:g} s",
-        todo="Look after the disk, or the network to it: what waits for it then goes on.",
+        todo="Look after the disk, or the network to it: what waits for it then continues.",
     )
     return _say_problem(found, error).model_copy(update={"is_silent": True, "is_unseen": False})
 

@@ -25,7 +25,7 @@ class _Late(Generic[T]):
 
     mark: object
     known: list[T]
-    """What it has found, the best last."""
+    """Results found so far, the best last."""
     made: Future[T] = field(default_factory=Future)
     clock: Callable[[], float] | None = None
     """Processor time of its thread [s]: it stands still while the disk does not answer."""

@@ -15,7 +15,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from flows.orchestration.prefect_environment import authorization
 from flows.web.access import Access
 from flows.web.guard import LOG, OPEN, SAFE, identify
-from flows.web.host_guard import SAFE_METHODS, refusal
+from flows.web.host_guard import refusal
 from flows.web.sessions import login_app
 
 FORM: Final = OPEN - {"/api/health"} | {"/api/session", "/api/logout"}
@@ -64,7 +64,7 @@ class DashboardLogin:
         who, role, _, _ = identify(self.access, scope, headers)
         if method and scope["path"] in self.form_paths:
             await self.form(scope, receive, send)
-        elif who is not None and role == "approver" and (is_own or method in SAFE_METHODS):
+        elif who is not None and role == "approver" and (is_own or method in SAFE):
             if method:
                 await self._ask(who, scope, receive, send)
             else:

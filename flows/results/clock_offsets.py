@@ -159,7 +159,7 @@ def propose(
     c: int,
     found: Synchronization,
 ) -> Proposal:
-    """Return the proposal of a camera.
+    """Return the proposal for one camera.
 
     The first one of its group whose clock does not change keeps its offset, so that one drift is
     not made that of all others.

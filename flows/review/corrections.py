@@ -112,7 +112,7 @@ def objections_now(store: Store, match: Match, latest: RunRecord | None) -> dict
             each = corrections[number]
             if not isinstance(each.edit, NamedTrack):
                 found |= {each.id: why} if why else {}
-            elif why is None:  # the run lacks the person, whom a correction since made
+            elif why is None:  # a correction since the run made the person
                 found.pop(each.id, None)
     return found
 

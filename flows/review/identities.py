@@ -207,9 +207,9 @@ def _replay(
 ) -> IdentityReplay:
     """Replay corrections over a result, which can contain the first merges and splits already.
 
-    People whom no correction names, or leaves without a name, have the names `stated`, unless a
-    merge removed their id and the run, which contains the first `in_run` merges and splits, has no
-    person with it. The objections are in the order of `said`.
+    People without a name by a correction have the names `stated`, unless a merge removed their id
+    and the run, which contains the first `in_run` merges and splits, has no person with it. The
+    objections are in the order of `said`.
     """
     merged, others = dict[int, IdentityEdit](), dict[int, IdentityEdit]()
     moves = (number for number, edit in enumerate(said) if isinstance(edit, TRACK_EDITS))
@@ -272,7 +272,7 @@ def _merged_away(
 def require_fitting(store: Store, match: Match, edits: Sequence[Edit]) -> list[Edit]:
     """Return edits, those of identities with sightings of their people in the current tracks.
 
-    So an edit does not apply to whom other tracks give the id.
+    Without sightings, an edit would apply to another person whom later tracks give the id.
 
     Raises:
         StaleEditError: another person changed the identities, or the edit never fitted.

@@ -1,4 +1,4 @@
-"""What a server of the pages refuses before its routes see it."""
+"""Refusal of requests to the pages, before their routes."""
 
 from __future__ import annotations
 
