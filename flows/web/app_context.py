@@ -427,5 +427,5 @@ class LocalRuns:
         with self._lock:
             self._process, self._is_cancelled = process, False
         code = process.wait()
-        # Before the command handles it, the signal of `cancel` ends the process.
-        return 130 if code < 0 and self._is_cancelled else code, said
+        # Before the command handles it, the signal of `cancel` ends the process or Python's start.
+        return 130 if code != 0 and self._is_cancelled else code, said
