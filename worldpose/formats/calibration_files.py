@@ -68,12 +68,7 @@ def build_camera(
 ) -> CameraCalibration:
     """Return the camera record; a rounded matrix becomes the nearest rotation.
 
-    Args:
-        where: file and camera, for messages.
-        name: id of the camera.
-        optics: image size, camera matrix and lens.
-        rotation: (3, 3), R in x_cam = R x_world + t.
-        translation: t [m].
+    Rotation (3, 3) and translation [m] are those of x_cam = R x_world + t.
 
     Raises:
         InputError: the size is not whole, a focal length is not positive, the matrix is no
@@ -134,11 +129,7 @@ def camera_id(name: str) -> str:
 def index_by_name(
     path: Path, cameras: list[tuple[str, CameraCalibration]]
 ) -> dict[str, CameraCalibration]:
-    """Return the cameras by id, in file order.
-
-    Args:
-        path: the file, for messages.
-        cameras: pairs of place in the file and camera.
+    """Return the cameras by id, in file order, from pairs of place in the file and camera.
 
     Raises:
         InputError: there is no camera, two cameras have one name, or no camera has a pose.
@@ -181,11 +172,9 @@ def read_calibration_toml(
 ) -> dict[str, CameraCalibration]:
     """Return the cameras of a TOML file by name, in file order.
 
-    Args:
-        path: the file.
-        left_out: receives cameras without a pose; None = all must have one.
-        sizes: width and height [px] of videos, for files whose size is no whole number: programs
-            that do not know it write twice the principal point.
+    `left_out` receives cameras without a pose; None = all must have one. `sizes` are those of
+    videos [px], for files whose size is no whole number: programs that do not know it write twice
+    the principal point.
 
     Raises:
         InputError: an entry is missing or invalid, the unit is another, or the world
@@ -235,11 +224,7 @@ def _lacks_pose(table: Mapping[str, Any]) -> bool:
 def camera_tables(
     path: Path, content: Mapping[str, Any] | None = None
 ) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-    """Yield the place, the camera's id and the table of each camera of a TOML file.
-
-    Args:
-        path: the file.
-        content: its tables; None = read them.
+    """Yield place, id and table of each camera of a TOML file, or of its content if that is known.
 
     Raises:
         InputError: the file is unreadable, or has an entry that is no table.
@@ -270,12 +255,7 @@ class Keys(NamedTuple):
 
 
 def read_optics(where: str, table: Mapping[str, Any], keys: Keys = Keys()) -> Optics:  # noqa: B008
-    """Return size, matrix and distortion of a camera's table.
-
-    Args:
-        where: file and camera, for messages.
-        table: entries by key.
-        keys: the form's names of the entries.
+    """Return size, matrix and distortion of a camera's table, whose entries have a form's names.
 
     Raises:
         InputError: an entry is missing or misshapen, or the lens has another model.
@@ -394,16 +374,10 @@ def read_camera_table(
     axes: NDArray[np.float64] | None = None,
     where_pose: str | None = None,
 ) -> CameraCalibration:
-    """Return the camera of a table.
+    """Return the camera of a table of numbers and lists of them, by a form's names of entries.
 
-    Args:
-        where: file and camera, for messages.
-        name: id of the camera.
-        table: entries by key, as numbers and lists of them.
-        keys: the form's names of the entries.
-        unit_m: unit of the translation [m].
-        axes: (3, 3) rotation A from the world of the file to one with z up, x' = A x; None = none.
-        where_pose: as `where`, for the pose, if it is in another file.
+    The translation is in `unit_m` [m]. `axes` (3, 3) is the rotation A from the world of the file
+    to one with z up, x' = A x. `where_pose` is the place of the pose, if it is in another file.
 
     Raises:
         InputError: an entry is missing, misshapen, infinite or impossible.

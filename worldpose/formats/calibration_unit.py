@@ -20,13 +20,7 @@ MILLIMETRE: Final = 1e-3
 def require_metres(
     path: Path, cameras: Mapping[str, CameraCalibration], unit_m: float = 1.0
 ) -> None:
-    """Raise InputError if the cameras' distances contradict the unit of the file.
-
-    Args:
-        path: the file, for messages.
-        cameras: cameras in metres, if the file has that unit.
-        unit_m: unit of length in the file [m].
-    """
+    """Raise InputError if the distances of cameras [m] contradict the unit of their file [m]."""
     # Minimum distance of the farthest camera from the middle in a file in millimetres [m].
     nearest_m = 0.1
     # Maximum distance of a camera from the middle of all [m]: around a stadium it is 200 m.

@@ -168,12 +168,8 @@ def _either(pairs: Flags) -> Flags:
 def read_people(path: Path) -> PeopleFile:
     """Return the people of one camera, and what was changed to read them.
 
-    Args:
-        path: `.json` (`read_coco_results`), `.npz` (`read_keypoint_arrays`), or a folder with a
-            JSON file of OpenPose for each frame (`read_openpose_folder`).
-
-    Raises:
-        InputError: the file is unreadable or invalid; the error names file and place.
+    It is `.json` (`read_coco_results`), `.npz` (`read_keypoint_arrays`), or a folder with a JSON
+    file of OpenPose for each frame (`read_openpose_folder`).
     """
     if path.is_dir():
         return read_openpose_folder(path)
@@ -183,15 +179,9 @@ def read_people(path: Path) -> PeopleFile:
 
 
 def read_observations(path: str | os.PathLike[str]) -> KeypointDetections:
-    """Return the detections of one camera, dense from the first to the last frame in the file.
+    """Return what `read_people` reads, dense from the first to the last frame in the file.
 
     Frames that the file lacks have no people.
-
-    Args:
-        path: a file or folder that `read_people` reads.
-
-    Raises:
-        InputError: the file is unreadable or invalid; the error names file and place.
     """
     path = Path(path)
     people = read_people(path).people
@@ -204,12 +194,8 @@ def select_ranges(
 ) -> KeypointDetections:
     """Return the people of `path`, dense over ranges of the camera's own frames.
 
-    Frames outside are left out; frames that the file lacks have no people.
-
-    Args:
-        path: the file, for messages.
-        people: its people.
-        ranges: first frame and number of frames of each range, rising and disjoint.
+    Ranges, first frame and number of frames, are rising and disjoint. Frames outside are left out;
+    frames that the file lacks have no people.
 
     Raises:
         InputError: all people are outside the wanted frames, or these are too many.

@@ -208,12 +208,10 @@ def _plain(name: str) -> str:
 
 
 def order_by_points(where: str, points: AnyFloats, stated: str | None = None) -> PointOrder:
-    """Return the order of points whose number alone is known, and perhaps a model.
+    """Return the order of points whose number alone is known, and perhaps a model of `MODELS`.
 
-    Args:
-        where: file, for messages.
-        points: (people, points, 3) x, y [px] and confidence; 0 = missing.
-        stated: name in `MODELS`, which counts if it has this number of points.
+    `points` (people, points, 3) are x, y [px] and confidence, 0 = missing. A stated model counts if
+    it has this number of points.
 
     Raises:
         InputError: no set has this number of points, or their lengths are those of another set or
@@ -310,11 +308,9 @@ def unknown_size(where: str, size: int) -> InputError:
 def _misfit(points: AnyFloats, pairs: NDArray[np.int64], lengths: Floats, least: int = 8) -> float:
     """Return the mean deviation of people's lengths [log] from the usual ones; NaN if unknown.
 
-    Args:
-        points: (people, points, 3).
-        pairs: (bones, 2, 2) places of the ends of the left and right bone.
-        lengths: (bones,) usual lengths, of which only ratios count.
-        least: fewest bones that have to be known; with 8 of 10 the face may be hidden.
+    `points` are (people, points, 3), `pairs` (bones, 2, 2) places of the ends of the left and right
+    bone, `lengths` (bones,) usual ones, of which only ratios count. `least` bones have to be known;
+    with 8 of 10 the face may be hidden.
     """
     sample = 2000  # people whose lengths are compared; more add nothing
     some = points[:: max(1, len(points) // sample)]
@@ -379,13 +375,9 @@ def people_by_frame(
 ) -> tuple[KeypointDetections, int]:
     """Return people by rising frame, and the number of entries that are nobody.
 
-    Args:
-        path: the file, for messages.
-        frames: (n,) frame of each entry.
-        points: (n, 17 or 23, 3) COCO-17 and perhaps `FEET`; confidence 0 = missing.
-        boxes: (n, 4) x, y, width, height [px]; NaN or None = that of the joints.
-        scores: (n,) NaN or None = the mean confidence of the joints.
-        limit: maximum size of the arrays [byte].
+    Of n entries: `frames` (n,); `points` (n, 17 or 23, 3) COCO-17 and perhaps `FEET`, confidence 0
+    = missing; `boxes` (n, 4) x, y, width, height [px], NaN = that of the joints; `scores` (n,), NaN
+    = the mean confidence of the joints. Arrays have at most `limit` bytes.
 
     Raises:
         InputError: too many people in a frame, or arrays that are too large.

@@ -188,13 +188,7 @@ def encode_scene(clip: ViewerClip) -> bytes:
 
 
 def encode_frames(clip: ViewerClip, first: int, count: int) -> bytes:
-    """Return people and the moving cameras in some frames.
-
-    Args:
-        clip: the clip.
-        first: index of the first frame.
-        count: number of frames; a part has at most those of a range.
-    """
+    """Return people and moving cameras in `count` frames, a range at most, from index `first`."""
     here = slice(first, first + min(count, clip.range_frames))
     joints = clip.joints[here]
     arrays: Arrays = {}
@@ -267,13 +261,9 @@ def decode_bodies(scene: bytes, frames: bytes) -> tuple[Floats, Floats]:
 def write_viewer(
     path: Path, page: str, clips: Sequence[ViewerClip], videos: Mapping[str, Path]
 ) -> None:
-    """Write a page with clips inside, which opens from disk without a network.
+    """Write the viewer's built page with clips and their mp4 files inside, whole or not at all.
 
-    Args:
-        path: the file, written whole or not at all.
-        page: the built page of the viewer, scripts and style inside.
-        clips: the clips.
-        videos: mp4 files by clip.
+    It opens from disk without a network.
 
     Raises:
         InputError: nobody is in the clips, or the file would be too large.
@@ -351,18 +341,11 @@ def _pack(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> byte
 def _quantize_rotations(
     model: BodyModel, poses: BodyParameters, there: Flags
 ) -> tuple[NDArray[np.int16], NDArray[np.float32]]:
-    """Return rotation vectors relative to the parents in whole units, and each joint's unit [rad].
+    """Return rotation vectors (frames, bodies, 24, 3) relative to the parents, and units [rad].
 
-    A joint's rotation relative to the world is rounded once only: the next one is relative to what
+    They are whole numbers times each joint's unit (24,); bodies that are not `there` have zeros. A
+    joint's rotation relative to the world is rounded once only: the next one is relative to what
     its parent became by rounding.
-
-    Args:
-        model: body model of the poses.
-        poses: (frames, bodies).
-        there: (frames, bodies), which of them are known; the others get zeros.
-
-    Returns:
-        (frames, bodies, 24, 3), and (24,).
     """
     parents = model.parents
     rotations = model.articulate(poses[there]).rotations

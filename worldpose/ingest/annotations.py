@@ -41,11 +41,7 @@ def read_clicked(
 ) -> dict[str, ClickedMarkings]:
     """Return the clicks of the static cameras of a match folder, in their order.
 
-    Args:
-        folder: the match folder.
-        spec: its match.yaml.
-        pitch: its pitch; None without a pitch.
-        whose: the pitch in words, for messages; None = names are not checked.
+    `whose` is the pitch in words, for messages; None = names are not checked.
 
     Raises:
         InputError: a file belongs to no static camera, or is invalid.
@@ -62,13 +58,7 @@ def read_clicked(
 def read_clicked_markings(
     file: Path, camera: CameraSpec, pitch: PitchSpec | None, whose: str | None = "the pitch"
 ) -> ClickedMarkings:
-    """Return the clicks in one camera's image.
-
-    Args:
-        file: JSON, a `ClickedMarkings`.
-        camera: the camera; all clicks must be inside its image.
-        pitch: the match's pitch; its template defines the names.
-        whose: as in `read_clicked`.
+    """Return the clicks in one camera's image, a JSON of `ClickedMarkings`; see `read_clicked`.
 
     Raises:
         InputError: the file is not JSON, or has an unknown key or name, no number, a repeated name,
@@ -84,13 +74,7 @@ def read_clicked_markings(
 def read_key_frames(
     folder: Path, spec: MatchSpec, pitch: PitchSpec | None, whose: str | None = "the pitch"
 ) -> dict[str, KeyFrames]:
-    """Return the clicked key frames by broadcast view, in the order of the clips.
-
-    Args:
-        folder: the match folder.
-        spec: its match.yaml.
-        pitch: its pitch; None without a pitch.
-        whose: as in `read_clicked`.
+    """Return the clicked key frames by broadcast view, in the order of the clips, as `read_clicked`.
 
     Raises:
         InputError: a file belongs to no clip with a broadcast camera, or is invalid.

@@ -60,17 +60,11 @@ def import_match(
     """Write a match folder with the cameras of a calibration and their detections.
 
     The only clip, `clip`, spans the first to the last frame with a person; frames keep their
-    numbers from the files. The function validates all 2D poses and stores them as npz.
-
-    Args:
-        calibration: a file or folder that `read_calibration` reads.
-        detections: folder with `<camera>.json` or `.npz` for each camera of the calibration, or
-            with a folder of OpenPose's files for each.
-        fps: frame rate of all cameras [1/s].
-        out: the match folder, absent or empty.
-        match_id: id of the match; None = the name of `out`.
-        pitch: "none", or None for the standard pitch, if the calibration's world is the pitch's.
-        place: brings the cameras to metres with z up; None = they are.
+    numbers from the files. The function validates all 2D poses and stores them as npz: they are
+    `<camera>.json` or `.npz` for each camera of the calibration, or a folder of OpenPose's files
+    for each. The match's id is by default the name of `out`, which is absent or empty. The pitch is
+    "none", or None for the standard pitch, if the calibration's world is the pitch's. `place`
+    brings the cameras to metres with z up; None = they are.
 
     Returns:
         Content of match.yaml, and sentences about what was found and what was changed.
@@ -190,14 +184,8 @@ def detections_by_camera(
 ) -> dict[str, Path]:
     """Return each camera's file of 2D poses, or its folder `<camera>` or `<camera>_json`.
 
-    Args:
-        folder: holds them.
-        cameras: the cameras.
-        calibration: file of the cameras, for messages.
-        left_out: as in `pick_cameras`.
-
     Raises:
-        InputError: fewer than two cameras have a file.
+        InputError: fewer than two cameras have a file; see `pick_cameras`.
     """
     suffixes = (".json", ".npz")
     there = [each for each in sorted(folder.glob("[!.]*")) if each.suffix.lower() in suffixes]
@@ -223,16 +211,11 @@ def import_lenses(
     """Write lenses without a pose into a match folder's lenses.toml, and return them.
 
     Static calibration takes them as prior of focal length, principal point and distortion; the
-    pose comes from clicks.
-
-    Args:
-        files: what `read_lenses` reads.
-        folder: the match folder, with match.yaml.
-        camera: the static camera of a file that names none.
+    pose comes from clicks. `camera` is the static camera of a file that names none.
 
     Raises:
-        InputError: a file is invalid, its camera is unknown or has a lens already, or calibration
-            .toml gives it with its pose.
+        InputError: a file is invalid (`read_lenses`), its camera is unknown or has a lens already,
+            or calibration.toml gives it with its pose.
     """
     spec = read_spec(folder)
     sizes = image_sizes(spec)
@@ -259,16 +242,10 @@ def pick_cameras(
     suffixes: Collection[str],
     left_out: LeftOut,
 ) -> dict[str, Path]:
-    """Return the file of each camera that has one.
+    """Return the file of each camera that has one, of those `found` in a folder by camera.
 
-    Args:
-        folder: holds them, for messages.
-        found: its files, by name of a camera.
-        cameras: the cameras.
-        calibration: file of the cameras, for messages.
-        suffixes: endings of such files, for messages.
-        left_out: further cameras, whose files are ignored; cameras without a file are added, and a
-            sentence about files without a camera.
+    Files of cameras that are left out are ignored; cameras without a file are added to these, and a
+    sentence about files without a camera. `calibration` and `suffixes` are for messages.
 
     Raises:
         InputError: fewer than two cameras have a file, or than all of fewer cameras.
@@ -300,20 +277,11 @@ def build_spec(
     offsets: Mapping[str, int] = MappingProxyType({}),
     pitch: str | None = "none",
 ) -> MatchSpec:
-    """Return match.yaml of a match with the one clip `clip`.
+    """Return match.yaml of a match with the one clip `clip`; InputError if an entry is invalid.
 
-    Args:
-        out: the match folder, whose name is the match's id if `match_id` is None.
-        match_id: id of the match.
-        fps: frame rate of all cameras [1/s].
-        sizes: width and height of the cameras' images [px].
-        frames: the clip's first frame, and the one after its last.
-        videos: file in `videos/` of those cameras that have one.
-        offsets: `offset_frames` of those cameras whose clock is another.
-        pitch: entry `pitch`.
-
-    Raises:
-        InputError: an entry is invalid.
+    `sizes` are the width and height of the cameras' images [px], `frames` the clip's first frame
+    and the one after its last, `videos` the files of those cameras that have one, `offsets` the
+    `offset_frames` of those whose clock is another.
     """
     content = {
         "match_id": match_id if match_id is not None else name_of(out),
@@ -362,17 +330,11 @@ def import_videos(
     The only clip, `clip`, ends with the last frame that two videos show; `offset_frames` can shift
     videos later. Cameras without a video are left out, and videos without a camera.
 
-    Args:
-        calibration: a file or folder that `read_calibration` reads; None = not known.
-        videos: folder with a video, or a folder of numbered images, for each camera of the
-            calibration, called as the camera.
-        out: the match folder, absent or empty.
-        fps: frame rate of all videos [1/s]; None = from the videos; images have none.
-        match_id: id of the match; None = the name of `out`.
-        boxes: folder with `<camera>.txt` of people's boxes (`read_boxes`), in which only poses are
-            estimated, for some of the cameras or all; None = people are detected.
-        place: brings the cameras to metres with z up; None = they are.
-        join: whether chapters of one recording, as GoPro names them, become one video.
+    `videos` has a video, or a folder of numbered images, for each camera, called as the camera;
+    `boxes` has `<camera>.txt` of people's boxes (`read_boxes`), in which only poses are estimated,
+    for some of the cameras or all. `fps` is by default that of the videos; images have none. With
+    `join`, chapters of one recording, as GoPro names them, become one video. Id, `out` and `place`
+    are as in `import_match`.
 
     Returns:
         Content of match.yaml, and sentences about what was found and what was changed.

@@ -73,11 +73,7 @@ def _read_keys(content: Mapping[str, object], keys: Sequence[str]) -> PitchSpec 
 
 
 def _check_size(content: Mapping[str, object], usual: PitchSpec, file: str) -> None:
-    """Raise InputError for an implausible pitch size in metres, with a guess of its unit.
-
-    Raises:
-        InputError: a number is out of bounds; the error names the key and the unit.
-    """
+    """Raise InputError for an implausible size of the pitch [m], with its key and a guess of its unit."""
     # Allowed sizes of a football pitch [m]: the Laws allow 90 to 120 by 45 to 90.
     allowed = {"length": (80.0, 130.0), "width": (40.0, 100.0)}
     # Allowed length and width of another game's pitch, relative to its template's [1].
@@ -101,12 +97,7 @@ def _check_size(content: Mapping[str, object], usual: PitchSpec, file: str) -> N
 
 
 def _check_points(points: object, pitch: PitchSpec, file: str) -> None:
-    """Raise InputError for surveyed points far from their places in the rules of the game.
-
-    Raises:
-        InputError: points are too far from there; the error names the point of the largest
-            distance.
-    """
+    """Raise InputError for the surveyed point farthest from its place in the rules, if too far."""
     from_laws = 2.0  # maximum distance of a surveyed point from its place in the rules, in plan [m]
     if not isinstance(points, dict):
         return  # the contract says what is wrong with them
@@ -143,11 +134,7 @@ def _is_number(value: object) -> TypeGuard[float]:
 
 
 def refuse_unread_pitch(folder: Path) -> None:
-    """Raise InputError if match.yaml names another pitch than pitch.json, or none.
-
-    Raises:
-        InputError: nothing would read pitch.json.
-    """
+    """Raise InputError if match.yaml names another pitch than pitch.json, or none."""
     file = folder / "match.yaml"
     content = read_yaml(file) if file.exists() else None
     named = content.get("pitch") if isinstance(content, dict) else None

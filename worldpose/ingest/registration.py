@@ -31,12 +31,9 @@ def register_match(match: MatchFolder, previous: Registration | None) -> Registr
     identity covers only the paths and contents of videos, detections and pitch, so that neither the
     folder's name nor an edited click, still, roster, estimate or calibration changes it.
 
-    Args:
-        match: match as read by `read_match`.
-        previous: the last registration of this folder, if any. A file with unchanged size and
-            modification time keeps its digest. As in git, this is only a shortcut: it misses a
-            change that preserves both; without `previous` the function reads all files. A video
-            of it that is gone keeps its digest, so that its results stay readable.
+    A file with the size and modification time of the `previous` registration of this folder keeps
+    its digest. As in git, this is only a shortcut: it misses a change that preserves both. A video
+    of it that is gone keeps its digest, so that its results stay readable.
 
     Raises:
         InputError: a file is empty, unreadable, or still being written.
@@ -142,12 +139,7 @@ def file_state(path: Path) -> tuple[int, int]:
 
 
 def require_settled(states: Mapping[Path, tuple[int, int]], what: str) -> None:
-    """Raise InputError for files that changed during reading, or change a moment later.
-
-    Args:
-        states: `file_state` of each file before reading.
-        what: what to do then, for messages.
-    """
+    """Raise InputError for files whose `file_state` changed in reading, or changes a moment later."""
     newest = max(modified for _, modified in states.values()) / 1e9
     wait = newest + SETTLE_SECONDS - time.time()
     if wait > 0:

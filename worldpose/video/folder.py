@@ -26,15 +26,10 @@ MAX_PIXELS: Final = 200_000_000
 
 
 def decode_image(content: Image, *, grey: bool = False, turned: bool = True) -> Image | None:
-    """Return an image (height, width, 3) RGB, or (height, width) grey.
+    """Return an image (height, width, 3) RGB, or (height, width) grey, of the bytes of a file.
 
-    Args:
-        content: (bytes,) content of an image file of `FORMATS`.
-        grey: without colour.
-        turned: as its EXIF tag says that it is shown, not as it is stored.
-
-    Returns:
-        None if the bytes are no whole image, or declare more than `MAX_PIXELS`.
+    It is `turned` as its EXIF tag says that it is shown, or as it is stored. None if the bytes are
+    no whole image of `FORMATS`, or declare more than `MAX_PIXELS`.
     """
     import cv2  # late: it takes 0.2 s, and few commands open an image
 
@@ -76,15 +71,7 @@ class ImageFolder(Pictures):
     """Images whose names end in their number; the lowest is frame 0, a gap a missing frame."""
 
     def __init__(self, folder: Path, index: FrameIndex | None = None) -> None:
-        """Open a folder.
-
-        Args:
-            folder: holds the images.
-            index: index of the images; if None, it is computed.
-
-        Raises:
-            InputError: no images, or names without a number or with the same one.
-        """
+        """Open a folder, whose index is computed if it is None; see `numbered_images`."""
         self.path = folder
         self._files = [file for _, file in numbered_images(folder)]
         self.index = index_images(folder) if index is None else index
@@ -153,11 +140,7 @@ def numbered_images(folder: Path) -> list[tuple[int, Path]]:
 
 
 def index_images(folder: Path) -> FrameIndex:
-    """Return the index of a folder of images; the size comes from the first one.
-
-    Raises:
-        InputError: no images, or names without a number or with the same one.
-    """
+    """Return the index of `numbered_images` of a folder; the size is that of the first one."""
     images = numbered_images(folder)
     stamps = np.array([number for number, _ in images], dtype=np.int64)
     first = _read(images[0][1], grey=True)
@@ -195,12 +178,7 @@ def _read(file: Path, *, grey: bool) -> Image | None:
 def some_pictures(
     video: VideoReader | ImageFolder, numbers: NDArray[np.integer]
 ) -> Iterator[tuple[int, Image | None]]:
-    """Yield selected frames in order; None where one cannot be decoded.
-
-    Args:
-        video: their source.
-        numbers: (pictures,) rising.
-    """
+    """Yield selected frames, of rising numbers (pictures,); None where one cannot be decoded."""
     for group in jumps(numbers, video.index.key):
         only = set(group.tolist())
         yield from video.readable(int(group[0]), int(group[-1]) + 1, only=only)
@@ -226,10 +204,7 @@ def readable_at(
 ) -> Iterator[Image | None]:
     """Yield the frame of each number; None for a negative one, and where none can be decoded.
 
-    Args:
-        video: their source.
-        numbers: (pictures,) with repetitions; decoding begins again where they go back.
-        grey: as of `Pictures.frames`.
+    Numbers (pictures,) may repeat; decoding begins again where they go back.
     """
     only = set(numbers.tolist())
     end = max(only, default=0) + 1
@@ -254,9 +229,8 @@ def grey_on_clock(path: Path, numbers: Integers, fps: float) -> Iterator[Image]:
 def jumps(numbers: NDArray[np.integer], key: Flags) -> list[NDArray[np.integer]]:
     """Return groups of frames, each decoded in one pass.
 
-    Args:
-        numbers: (pictures,) selected, rising.
-        key: (all pictures,) whether decoding can begin there.
+    `numbers` (pictures,) are selected, rising; `key` (all pictures,) are frames where decoding can
+    begin.
     """
     if not len(numbers):
         return []
@@ -271,11 +245,8 @@ def median_picture(frames: Iterable[Image], most: int = 64) -> Image:
     """Return the median of a clip's frames, which shows no moving people.
 
     At most `most` frames are in memory, evenly spread over the clip: when the limit is reached, the
-    function drops every second frame and doubles the stride.
-
-    Args:
-        frames: (height, width) or (height, width, 3) each, of one camera that does not move.
-        most: maximum number of frames in memory, two or more.
+    function drops every second frame and doubles the stride. Frames are (height, width) or (height,
+    width, 3), of one camera that does not move.
 
     Raises:
         InputError: there are no frames, their sizes differ, or `most` is below two.

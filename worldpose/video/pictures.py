@@ -125,11 +125,7 @@ class FrameIndex:
 
 
 def _count_dropped(steps: Floats) -> int:
-    """Return how many frames a recorder of the clock's rate left out.
-
-    Args:
-        steps: (pictures - 1,) steps between images [frames of the clock].
-    """
+    """Return how many frames a recorder of the clock's rate left out, by steps of images [frame]."""
     if not len(steps) or abs(float(np.median(steps)) - 1.0) > RATE_SLACK:
         return 0
     whole = np.rint(steps)
@@ -168,12 +164,9 @@ class Pictures(ABC):
     def frames(
         self, start: int = 0, stop: int | None = None, *, grey: bool = False
     ) -> Iterator[tuple[int, Image]]:
-        """Yield frame numbers from `start` up to before `stop`, each with its image.
+        """Yield frame numbers from `start` up to before `stop`, or the end, each with its image.
 
-        Args:
-            start: first frame.
-            stop: one past the last; the end of the video if None.
-            grey: luma (height, width) as stored, in half the time, instead of RGB.
+        Grey is luma (height, width) as stored, in half the time, instead of RGB.
 
         Raises:
             InputError: there are no such frames, or one cannot be decoded.

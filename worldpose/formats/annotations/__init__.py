@@ -57,22 +57,12 @@ def detect_format(content: bytes) -> Format:
 def write_annotations(
     path: Path, pictures: Sequence[AnnotatedImage], form: Format = "coco"
 ) -> None:
-    """Write annotated images in a format.
-
-    Args:
-        path: the file; overwritten.
-        pictures: images with unique names.
-        form: the format.
-    """
+    """Write images of unique names in a format; an existing file is overwritten."""
     path.write_bytes(_CODECS[form].encode(pictures))
 
 
 def read_annotations(path: Path, form: Format | None = None) -> list[AnnotatedImage]:
-    """Return the images of a file, in its order.
-
-    Args:
-        path: the file.
-        form: its format; None = detect from its content.
+    """Return the images of a file, in its order; without a format, its content tells it.
 
     Raises:
         InputError: the content is invalid; nothing is read.
