@@ -26,6 +26,7 @@ from worldpose.simulation.foreign.matches import simulate_foreign_scene
 from worldpose.simulation.foreign.scenarios import FOREIGN_SCENARIOS
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
+from worldpose.simulation.settings import MatchOptions
 from worldpose.tracking.tracker import track_people
 from worldpose.triangulation.clocks import shift_in_time
 from worldpose.triangulation.synchronization import Synchronization, shift_frames, synchronize
@@ -132,10 +133,12 @@ def draw_rig(seed: int, kind: str | None) -> Rig:
         scene = simulate_foreign_scene(
             scenario,
             seed + 1_000_000 * attempt,
-            duration=rng.uniform(4.0, 8.0),
-            cameras=int(rng.integers(4, 19)),
-            people=int(rng.integers(5, 23)),
-            calibrated=True,
+            MatchOptions(
+                duration=rng.uniform(4.0, 8.0),
+                cameras=int(rng.integers(4, 19)),
+                players=int(rng.integers(5, 23)),
+                calibrated=True,
+            ),
         )
         names, middle = list(scene.cameras), np.nanmedian(scene.truth.joints, axis=(0, 1, 2))
         true = [scene.cameras[name].camera for name in names]

@@ -46,7 +46,7 @@ from worldpose.ingest.match_folder import read_match
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.crowd import gather
 from worldpose.simulation.mannequins import assign_roles, dress_people
-from worldpose.simulation.renderer import open_view, render_frame
+from worldpose.simulation.renderer import Moment, open_view
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import place_camera
 from worldpose.simulation.settings import RenderingSettings, RigSettings
@@ -178,7 +178,7 @@ def render_crowd(people: int, frames: int) -> tuple[float, list[Image], Camera, 
 
     def film(frame: int) -> Image:
         moment = (cast.pose(poses[:, frame]), cast.pose(later[:, frame]))
-        return render_frame(view, cast, *moment, frame=frame).image
+        return view.expose(Moment(cast, *moment), frame).image
 
     film(0)
     return *time_work(lambda: [film(frame) for frame in range(frames)]), camera, pitch

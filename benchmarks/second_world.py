@@ -43,8 +43,9 @@ from worldpose.ingest.footage import unit_frames
 from worldpose.ingest.match_folder import read_match
 from worldpose.simulation.foreign.matches import simulate_foreign_match
 from worldpose.simulation.foreign.scenarios import FOREIGN_SCENARIOS
-from worldpose.simulation.matches import MatchOptions, simulate_match
+from worldpose.simulation.matches import simulate_match
 from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.settings import MatchOptions
 from worldpose.store.store import Run, Store, open_run
 
 MIX = (
@@ -339,23 +340,14 @@ def measure(plan: dict[str, Any], folder: Path) -> dict[str, Any]:
     out, project = folder / "match", folder / "project"
     row = dict(plan)
     begun = time.monotonic()
+    options = MatchOptions(duration=plan["duration"], video=False, calibrated=plan["calibrated"])
     if name in FOREIGN_SCENARIOS:
         recordings = None if plan["recordings"] is None else Path(plan["recordings"])
-        simulate_foreign_match(
-            FOREIGN_SCENARIOS[name],
-            seed,
-            out,
-            duration=plan["duration"],
-            recordings=recordings,
-            calibrated=plan["calibrated"],
-        )
+        simulate_foreign_match(FOREIGN_SCENARIOS[name], seed, out, options, recordings)
         record = json.loads((out / "reference" / "world.json").read_text())
         row |= {key: record[key] for key in ("layout", "pitch", "calibration")}
         row["detector"] = record["detector"]["name"]
     else:
-        options = MatchOptions(
-            duration=plan["duration"], video=False, calibrated=plan["calibrated"]
-        )
         simulate_match(SCENARIOS[name], seed, out, options)
     row["simulated_s"] = round(time.monotonic() - begun, 1)
     spec = read_match(out).spec

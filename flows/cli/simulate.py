@@ -52,8 +52,9 @@ def simulate(
     """
     from worldpose.simulation.foreign.matches import simulate_foreign_match
     from worldpose.simulation.foreign.scenarios import FOREIGN_SCENARIOS
-    from worldpose.simulation.matches import MatchOptions, simulate_match
+    from worldpose.simulation.matches import simulate_match
     from worldpose.simulation.scenarios import SCENARIOS
+    from worldpose.simulation.settings import MatchOptions
 
     about = {name: each.about for name, each in (SCENARIOS | FOREIGN_SCENARIOS).items()}
     if scenario == "list":
@@ -71,6 +72,18 @@ def simulate(
         raise UsageError(
             "--masks", expected="--masks with --render", found="no --render", todo="Add --render."
         )
+    options = MatchOptions(
+        duration=duration,
+        cameras=cameras,
+        players=players,
+        trajectories=trajectories,
+        mocap=mocap,
+        calibrated=calibrated,
+        stills=stills,
+        video=video,
+        render=render,
+        masks=masks,
+    )
     if scenario in FOREIGN_SCENARIOS:
         _refuse_options(
             f"foreign scenario {scenario}",
@@ -81,38 +94,13 @@ def simulate(
                 "--players 0": players == 0,
             },
         )
-        spec = simulate_foreign_match(
-            FOREIGN_SCENARIOS[scenario],
-            seed,
-            out,
-            duration=duration,
-            cameras=cameras,
-            people=players,
-            recordings=recordings,
-            calibrated=calibrated,
-        )
+        foreign = FOREIGN_SCENARIOS[scenario]
+        spec = simulate_foreign_match(foreign, seed, out, options, recordings)
         _report_match(spec.match_id, out)
         return
     _refuse_options(f"scenario {scenario}", {"--recordings": recordings is not None})
     with _show_rendering() as advance:
-        spec = simulate_match(
-            SCENARIOS[scenario],
-            seed,
-            out,
-            MatchOptions(
-                duration=duration,
-                cameras=cameras,
-                players=players,
-                trajectories=trajectories,
-                mocap=mocap,
-                calibrated=calibrated,
-                stills=stills,
-                video=video,
-                render=render,
-                masks=masks,
-            ),
-            advance=advance,
-        )
+        spec = simulate_match(SCENARIOS[scenario], seed, out, options, advance=advance)
     _report_match(spec.match_id, out)
 
 

@@ -16,7 +16,7 @@ from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.crowd import Crowd, gather
 from worldpose.simulation.mannequins import Surfaces, assign_roles, dress_people
-from worldpose.simulation.renderer import RenderedFrame, open_view, render_frame
+from worldpose.simulation.renderer import Moment, RenderedFrame, open_view
 from worldpose.simulation.scene import place_camera
 from worldpose.simulation.settings import (
     PATTERNS,
@@ -156,7 +156,8 @@ def render_scene(kind: SceneKind, seed: int, *, views: int, frames: int) -> Iter
         view = open_view(camera, pitch, seed, settings)
         for frame in range(frames):
             surfaces = cast.pose(poses[:, frame])
-            rendered = render_frame(view, cast, surfaces, cast.pose(later[:, frame]), frame=frame)
+            moment = Moment(cast, surfaces, cast.pose(later[:, frame]))
+            rendered = view.expose(moment, frame)
             name = f"{index}_{frame}.jpg"
             yield Shot(name, rendered, camera, joints[frame], poses[:, frame], surfaces)
 

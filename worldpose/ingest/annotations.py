@@ -74,7 +74,7 @@ def read_clicked_markings(
 def read_key_frames(
     folder: Path, spec: MatchSpec, pitch: PitchSpec | None, whose: str | None = "the pitch"
 ) -> dict[str, KeyFrames]:
-    """Return the clicked key frames by broadcast view, in the order of the clips, as `read_clicked`.
+    """Return the clicked key frames by broadcast view, in their order; see `read_clicked`.
 
     Raises:
         InputError: a file belongs to no clip with a broadcast camera, or is invalid.

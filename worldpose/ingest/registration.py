@@ -139,7 +139,7 @@ def file_state(path: Path) -> tuple[int, int]:
 
 
 def require_settled(states: Mapping[Path, tuple[int, int]], what: str) -> None:
-    """Raise InputError for files whose `file_state` changed in reading, or changes a moment later."""
+    """Raise InputError for files whose `file_state` changed since, or changes a moment later."""
     newest = max(modified for _, modified in states.values()) / 1e9
     wait = newest + SETTLE_SECONDS - time.time()
     if wait > 0:

@@ -118,7 +118,7 @@ def _known_keys(model: type[Record], loc: tuple[int | str, ...]) -> list[str]:
 
 
 def require_local(name: str, where: str) -> None:
-    """Raise InputError for a name that is no path in the match folder: absolute, with `..`, or empty."""
+    """Raise InputError for a name that is no path in the match folder: absolute, empty, with .."""
     posix, windows = PurePosixPath(name), PureWindowsPath(name)
     if not posix.parts or posix.is_absolute() or windows.anchor or ".." in posix.parts:
         todo = "Move or copy the file into the match folder and name it from there."

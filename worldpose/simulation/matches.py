@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from data_contracts.arrays import Floats, Image, Singles
+from data_contracts.arrays import Floats, Image
 from data_contracts.broadcast_calibration import KeyFrames
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from worldpose.body.body_file import OPEN_BODY, load_open_body
@@ -31,54 +31,114 @@ from worldpose.simulation.mannequins import Cast, assign_roles, dress_people
 from worldpose.simulation.paths import Clip, GroundPath
 from worldpose.simulation.recordings import read_clip, read_trajectories
 from worldpose.simulation.reference import CLIP_ID, write_reference
-from worldpose.simulation.renderer import (
-    Moment,
-    RenderedFrame,
-    film_broadcast,
-    open_view,
-    render_frame,
-)
+from worldpose.simulation.renderer import Moment, RenderedFrame, film_broadcast, open_view
 from worldpose.simulation.scene import Scene, broadcast_id, simulate_scene
-from worldpose.simulation.settings import CalibrationErrors, Scenario
+from worldpose.simulation.settings import CalibrationErrors, MatchOptions, Scenario
 from worldpose.simulation.venues import build_venue
 from worldpose.video.files import write_video
 
 Advance = Callable[[str, int, int], None]
 
 
-def _film_scene(
-    stage: _FilmSet, folder: Path, options: MatchOptions, advance: Advance | None
-) -> None:
-    """Write the videos of all cameras into a match folder, frame by frame.
+def simulate_match(
+    scenario: Scenario,
+    seed: int,
+    out: Path,
+    options: MatchOptions = MatchOptions(),  # noqa: B008
+    *,
+    advance: Advance | None = None,
+) -> MatchSpec:
+    """Write a synthetic match folder with its ground truth, and return its match.yaml.
 
-    docs/explanation/simulation.md describes the files.
+    The same arguments give the same bytes; docs/explanation/simulation.md describes the files. The
+    match's id names scenario, seed and overrides of the scenario. `out` is absent or an empty
+    folder; the write is atomic. `advance` receives the filming's progress.
+
+    Raises:
+        InputError: `out` holds files, or the trajectories or the capture cannot be used.
     """
-    # Maximum number of cameras filmed at a time: each holds its empty stadium and encoder
-    # frames.
-    at_once = 4
+    scenario, driven, clip = _apply_options(scenario, options)
+    scene = simulate_scene(scenario, seed, driven=driven, clip=clip)
+    stage = _Stage(scene, scenario, seed, options, advance)
+    has_errors = scenario.calibration != CalibrationErrors()
+    given = scene.given if options.calibrated or has_errors else {}
+    spec = stage.describe(options.name(scenario.name, seed, *_replayed(options)))
+    write_match(
+        out,
+        spec,
+        calibrations={name: camera.to_calibration(name) for name, camera in given.items()},
+        observations={} if options.render else scene.observations,
+        pitch=scene.surveyed,
+        annotations=MatchAnnotations(
+            clicked={name: clicks.markings for name, clicks in scene.clicks.items()},
+            key_frames=stage.key_frames(),
+        ),
+        stills=stage.draw_stills() if options.stills and not options.render else {},
+        further=stage.write_further,
+    )
+    return spec
 
-    def film(name: str) -> None:
-        part = "broadcast" if name in stage.scene.broadcast else "videos"
-        file = folder / part / f"{name}.mp4"
-        file.parent.mkdir(exist_ok=True)
-        labelled = _keep_labels(stage, name, folder, options, advance)
-        write_video(file, labelled, stage.fps(name))
 
-    names = [*stage.scene.cameras, *stage.scene.broadcast]
-    with ThreadPoolExecutor(min(at_once, os.cpu_count() or 1)) as pool:
-        for _ in pool.map(film, names):
-            pass
+def _replayed(options: MatchOptions) -> list[str]:
+    """Return names of the recordings that people replay."""
+    files = {"tracks": options.trajectories, "mocap": options.mocap}
+    return [
+        f"{kind}{hashlib.sha256(file.read_bytes()).hexdigest()[:8]}"
+        for kind, file in files.items()
+        if file is not None
+    ]
 
 
-class _FilmSet:
-    """A dressed scene ready for filming."""
+def _apply_options(
+    scenario: Scenario, options: MatchOptions
+) -> tuple[Scenario, list[GroundPath] | None, Clip | None]:
+    """Return the changed scenario, tracked paths, and motion capture."""
+    updates, driven = dict[str, object](), None
+    duration = scenario.duration if options.duration is None else options.duration
+    if options.cameras is not None:
+        updates["rig"] = scenario.rig.model_copy(update={"cameras": options.cameras})
+    if options.players is not None:
+        updates["crowd"] = scenario.crowd.model_copy(update={"people": options.players})
+    if options.trajectories is not None:
+        driven, duration = read_trajectories(options.trajectories, duration, options.players)
+    if options.calibrated:
+        updates["calibration"] = CalibrationErrors()
+    clip = None if options.mocap is None else read_clip(options.mocap)
+    return scenario.model_copy(update={**updates, "duration": duration}), driven, clip
 
-    def __init__(self, scene: Scene, scenario: Scenario, seed: int) -> None:
-        self.scene, self.scenario, self.seed = scene, scenario, seed
-        self.pitch = PitchTemplate.from_spec(scenario.pitch)
-        # One more than there are frames: positions of people while the last frame's shutter is
-        # open.
-        self.times = np.arange(len(scene.truth.frames) + 1) / scenario.fps
+
+@dataclass
+class _Stage:
+    """A dressed scene ready for filming, and the files of a match of it."""
+
+    scene: Scene
+    scenario: Scenario
+    seed: int
+    options: MatchOptions
+    advance: Advance | None
+
+    @functools.cached_property
+    def pitch(self) -> PitchTemplate:
+        """Return the pitch as painted."""
+        return PitchTemplate.from_spec(self.scenario.pitch)
+
+    @functools.cached_property
+    def times(self) -> Floats:
+        """Return the times of the frames and of one more [s], when the last shutter is open."""
+        return np.arange(len(self.scene.truth.frames) + 1) / self.scenario.fps
+
+    @functools.cached_property
+    def poses(self) -> BodyParameters:
+        """Return the bodies (persons, times)."""
+        return self.scene.crowd.poses(self.times)
+
+    @functools.cached_property
+    def cast(self) -> Cast:
+        """Return the people in their clothes."""
+        crowd = self.scene.crowd
+        roles = assign_roles(self.scenario.crowd, len(crowd.paths))
+        betas = np.array([body.betas for body in crowd.bodies]).reshape(-1, 10)
+        return dress_people(betas, roles, self.seed, self.scenario.look.patterns)
 
     def fps(self, name: str) -> float:
         """Return the frame rate of a camera [1/s]."""
@@ -90,32 +150,19 @@ class _FilmSet:
         view = self.scene.broadcast.get(name)
         return len(self.scene.truth.frames) if view is None else len(view.times)
 
-    @functools.cached_property
-    def poses(self) -> BodyParameters:
-        """Return the bodies (persons, times)."""
-        return self.scene.crowd.poses(self.times)
-
-    @functools.cached_property
-    def cast(self) -> Cast:
-        """Return the people in their clothes."""
-        crowd, look = self.scene.crowd, self.scenario.look
-        roles = assign_roles(self.scenario.crowd, len(crowd.paths))
-        betas = np.array([body.betas for body in crowd.bodies]).reshape(-1, 10)
-        return dress_people(betas, roles, self.seed, look.patterns)
-
     def film(self, name: str, frames: int | None = None) -> Iterator[RenderedFrame]:
         """Yield the first frames of a static camera or a broadcast view, by default all."""
-        fps = self.fps(name)
+        fps, look = self.fps(name), self.scenario.look
         count = self.count(name) if frames is None else frames
         late = self.scene.clocks.get(name, 0.0) / fps
         moments = self._moments(np.arange(count + 1) / fps + late, fps)
         if name in self.scene.broadcast:
-            venue = build_venue(self.pitch, self.seed, self.scenario.look)
+            venue = build_venue(self.pitch, self.seed, look)
             yield from film_broadcast(self.scene.broadcast[name].camera, venue, moments)
             return
-        view = open_view(self.scene.cameras[name], self.pitch, self.seed, self.scenario.look)
-        for frame, each in enumerate(moments):
-            yield render_frame(view, each.cast, each.opened, each.closed, frame=frame)
+        view = open_view(self.scene.cameras[name], self.pitch, self.seed, look)
+        for frame, moment in enumerate(moments):
+            yield view.expose(moment, frame)
 
     def _moments(self, times: Floats, fps: float) -> Iterator[Moment]:
         """Yield the people in every frame of a camera, from its times and that of one more [s]."""
@@ -127,224 +174,116 @@ class _FilmSet:
             closed = opened.toward(following, share) if share > 0.0 else opened
             yield Moment(self.cast, opened, closed)
 
+    def draw_stills(self) -> dict[str, Image]:
+        """Return the first image of every static camera."""
+        names = list(self.scene.cameras)
+        with ThreadPoolExecutor() as pool:  # the renderer's kernels release the GIL
+            drawn = pool.map(lambda name: next(self.film(name, 1)).image, names)
+            return dict(zip(names, drawn, strict=True))
 
-def _keep_labels(
-    stage: _FilmSet, name: str, folder: Path, options: MatchOptions, advance: Advance | None
-) -> Iterator[Image]:
-    """Yield a camera's images, and write its still, masks and boxes."""
-    boxes, visible = list[Singles](), list[Singles]()
-    masks = folder / "reference" / "masks" / name
-    if options.masks:
-        masks.mkdir(parents=True)
-    for number, frame in enumerate(stage.film(name)):
-        boxes.append(frame.boxes.astype(np.float32))
-        visible.append(frame.visible.astype(np.float32))
-        if options.stills and name in stage.scene.cameras and number == 0:
-            write_still(folder / "stills" / f"{name}.png", frame.image)
-        if options.masks:
-            file = masks / f"{number:06d}.png"
-            cv2.imwrite(str(file), (frame.person_ids + 1).astype(np.uint8))
-        yield frame.image
-        if advance is not None:
-            advance(name, number + 1, stage.count(name))
-    file = folder / "reference" / "boxes" / f"{name}.npz"
-    write_archive(file, {"boxes": np.array(boxes), "visible": np.array(visible)})
-
-
-@dataclass(frozen=True)
-class MatchOptions:
-    """Changes of a simulated match to its scenario, and the files to write."""
-
-    duration: float | None = None
-    """[s], instead of the scenario's."""
-    cameras: int | None = None
-    """Number of static cameras, instead of the scenario's."""
-    players: int | None = None
-    """Number of people, instead of the scenario's."""
-    trajectories: Path | None = None
-    """Tracking data (`read_trajectories`) that drives the people instead; the clip ends with it."""
-    mocap: Path | None = None
-    """Motion capture (`worldpose.simulation.recordings.read_clip`) that one person plays."""
-    calibrated: bool = False
-    """Write the true static cameras as calibration.toml; without, the folder has such a file only
-    if the scenario has calibration errors."""
-    stills: bool = True
-    """Add one image of every static camera, about a second each."""
-    video: bool = True
-    """If the scenario has key frames, add the broadcast camera's video, about 0.1 s per frame,
-    annotated key frames, and bodies from a simulated monocular method (`estimates/`)."""
-    render: bool = False
-    """Film all cameras, and write no detections, so that pixels are the only input."""
-    masks: bool = False
-    """Add person masks of all filmed frames."""
-
-
-def simulate_match(
-    scenario: Scenario,
-    seed: int,
-    out: Path,
-    options: MatchOptions | None = None,
-    *,
-    advance: Advance | None = None,
-) -> MatchSpec:
-    """Write a synthetic match folder with its ground truth; the same arguments give the same bytes.
-
-    docs/explanation/simulation.md describes the files.
-
-    `out` is absent or an empty folder; the write is atomic. `advance` receives the filming's
-    progress.
-
-    Returns:
-        The match's match.yaml. Its id names scenario, seed and overrides of the scenario.
-
-    Raises:
-        InputError: `out` holds files, or the trajectories or the capture cannot be used.
-    """
-    options = options or MatchOptions()
-    scenario, changes, driven, clip = _apply_options(scenario, options)
-    scene = simulate_scene(scenario, seed, driven=driven, clip=clip)
-    given = scene.given if options.calibrated or scenario.calibration != CalibrationErrors() else {}
-    stage = _FilmSet(scene, scenario, seed)
-    images = _draw_stills(stage) if options.stills and not options.render else {}
-    spec = _describe_match(scenario, scene, "-".join([scenario.name, str(seed), *changes]), options)
-    write_match(
-        out,
-        spec,
-        calibrations={name: camera.to_calibration(name) for name, camera in given.items()},
-        observations={} if options.render else scene.observations,
-        pitch=scene.surveyed,
-        annotations=MatchAnnotations(
-            clicked={name: clicks.markings for name, clicks in scene.clicks.items()},
-            key_frames=_key_frames(scenario, scene, seed)
-            if options.video or options.render
-            else {},
-        ),
-        stills=images,
-        further=lambda folder: _write_further(stage, folder, options, advance),
-    )
-    return spec
-
-
-def _describe_match(
-    scenario: Scenario, scene: Scene, match_id: str, options: MatchOptions
-) -> MatchSpec:
-    width, height = scenario.rig.image_size_px
-    stills = {name: f"stills/{name}.png" if options.stills else None for name in scene.cameras}
-    specs = [
-        CameraSpec(id=name, width=width, height=height, still=still)
-        for name, still in stills.items()
-    ]
-    moving = []
-    for number, view in enumerate(scene.broadcast.values()):
-        wide, high = view.camera.image_size.reshape(-1, 2)[0].tolist()
-        fps = None if view.fps == scenario.fps else view.fps
-        name = broadcast_id(number)
-        moving.append(CameraSpec(id=name, kind="broadcast", width=wide, height=high, fps=fps))
-    names = tuple(camera.id for camera in moving)
-    broadcast = names if len(names) > 1 else next(iter(names), None)
-    return MatchSpec(
-        match_id=match_id,
-        fps=scenario.fps,
-        cameras=(*specs, *moving),
-        clips=(ClipSpec(id=CLIP_ID, frame_count=len(scene.truth.frames), broadcast=broadcast),),
-    )
-
-
-def _write_further(
-    stage: _FilmSet, folder: Path, options: MatchOptions, advance: Advance | None
-) -> None:
-    """Write ground truth, videos, and bodies of a monocular method."""
-    scene, scenario = stage.scene, stage.scenario
-    _write_truth(folder / "reference", scenario, scene, detected=not options.render)
-    if options.render:
-        _film_scene(stage, folder, options, advance)
-        return
-    is_filmed = scenario.key_frames and options.video
-    for number, (name, view) in enumerate(scene.broadcast.items() if is_filmed else ()):
-        video = folder / "broadcast" / f"{name}.mp4"
-        video.parent.mkdir(exist_ok=True)
-        write_video(video, (frame.image for frame in stage.film(name)), view.fps)
-        poses = scene.poses if view.fps == scenario.fps else scene.crowd.poses(view.times)
-        given = (poses.betas, poses.global_orient, poses.body_pose, poses.transl)
-        bodies = BodyParameters(*(np.swapaxes(values, 0, 1) for values in given))
-        rng = np.random.default_rng([stage.seed, 5, number][: 3 if number else 2])
-        found = estimate_bodies(
-            load_open_body(), bodies, view.camera, view.fps, MonocularErrors(), rng
+    def describe(self, match_id: str) -> MatchSpec:
+        """Return match.yaml."""
+        scene, scenario, specs = self.scene, self.scenario, list[CameraSpec]()
+        width, height = scenario.rig.image_size_px
+        for name in scene.cameras:
+            still = f"stills/{name}.png" if self.options.stills else None
+            specs.append(CameraSpec(id=name, width=width, height=height, still=still))
+        names = tuple(broadcast_id(number) for number in range(len(scene.broadcast)))
+        for name, view in zip(names, scene.broadcast.values(), strict=True):
+            wide, high = view.camera.image_size.reshape(-1, 2)[0].tolist()
+            fps = None if view.fps == scenario.fps else view.fps
+            specs.append(CameraSpec(id=name, kind="broadcast", width=wide, height=high, fps=fps))
+        broadcast = names if len(names) > 1 else next(iter(names), None)
+        frames = len(scene.truth.frames)
+        return MatchSpec(
+            match_id=match_id,
+            fps=scenario.fps,
+            cameras=tuple(specs),
+            clips=(ClipSpec(id=CLIP_ID, frame_count=frames, broadcast=broadcast),),
         )
-        write_archive(folder / "estimates" / f"{name}.npz", found)
 
+    def key_frames(self) -> dict[str, KeyFrames]:
+        """Return the annotated key frames of the broadcast cameras' videos, if there are any."""
+        scenario, scene = self.scenario, self.scene
+        if not (scenario.key_frames and (self.options.video or self.options.render)):
+            return {}
+        rng, clicked = np.random.default_rng([self.seed, 4]), {}
+        for name, view in scene.broadcast.items():
+            is_usual = view.fps == scenario.fps
+            people = scene.truth.joints if is_usual else scene.crowd.joints(view.times)
+            clicked[name] = click_key_frames(
+                view.camera, self.pitch, people, scenario.clicks, scenario.key_frames, rng
+            )
+        return clicked
 
-def _apply_options(
-    scenario: Scenario, options: MatchOptions
-) -> tuple[Scenario, list[str], list[GroundPath] | None, Clip | None]:
-    """Return the changed scenario, names of the changes, tracked paths, and motion capture."""
-    changes, updates, driven, clip = [], dict[str, object](), None, None
-    duration = scenario.duration
-    if options.duration is not None:
-        duration = options.duration
-        changes.append(f"{duration:g}s")
-    if options.cameras is not None:
-        updates["rig"] = scenario.rig.model_copy(update={"cameras": options.cameras})
-        changes.append(f"{options.cameras}cameras")
-    if options.players is not None:
-        updates["crowd"] = scenario.crowd.model_copy(update={"people": options.players})
-        changes.append(f"{options.players}players")
-    if options.trajectories is not None:
-        driven, duration = read_trajectories(options.trajectories, duration, options.players)
-        changes.append(f"tracks{_digest(options.trajectories)}")
-    if options.mocap is not None:
-        clip = read_clip(options.mocap)
-        changes.append(f"mocap{_digest(options.mocap)}")
-    if options.calibrated:
-        updates["calibration"] = CalibrationErrors()
-        changes.append("calibrated")
-    updates["duration"] = duration
-    return scenario.model_copy(update=updates), changes, driven, clip
+    def write_further(self, folder: Path) -> None:
+        """Write ground truth, videos, and bodies of a monocular method."""
+        scene, scenario, options = self.scene, self.scenario, self.options
+        self._write_truth(folder / "reference")
+        if options.render:
+            # Each camera holds its empty stadium and encoder frames.
+            with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+                names = (*scene.cameras, *scene.broadcast)
+                list(pool.map(lambda name: self._write_film(name, folder), names))
+            return
+        is_filmed = scenario.key_frames and options.video
+        for number, (name, view) in enumerate(scene.broadcast.items() if is_filmed else ()):
+            video = folder / "broadcast" / f"{name}.mp4"
+            video.parent.mkdir(exist_ok=True)
+            write_video(video, (frame.image for frame in self.film(name)), view.fps)
+            poses = scene.poses if view.fps == scenario.fps else scene.crowd.poses(view.times)
+            given = (poses.betas, poses.global_orient, poses.body_pose, poses.transl)
+            bodies = BodyParameters(*(np.swapaxes(values, 0, 1) for values in given))
+            rng = np.random.default_rng([self.seed, 5, number][: 3 if number else 2])
+            found = estimate_bodies(
+                load_open_body(), bodies, view.camera, view.fps, MonocularErrors(), rng
+            )
+            write_archive(folder / "estimates" / f"{name}.npz", found)
 
+    def _write_film(self, name: str, folder: Path) -> None:
+        """Write a camera's video, still, masks and boxes."""
+        is_static = name in self.scene.cameras
+        file = folder / ("videos" if is_static else "broadcast") / f"{name}.mp4"
+        masks = folder / "reference" / "masks" / name
+        file.parent.mkdir(exist_ok=True)
+        if self.options.masks:
+            masks.mkdir(parents=True)
+        boxes, visible = [], []
 
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:8]
+        def images() -> Iterator[Image]:
+            for number, frame in enumerate(self.film(name)):
+                boxes.append(frame.boxes.astype(np.float32))
+                visible.append(frame.visible.astype(np.float32))
+                if self.options.stills and is_static and number == 0:
+                    write_still(folder / "stills" / f"{name}.png", frame.image)
+                if self.options.masks:
+                    mask = (frame.person_ids + 1).astype(np.uint8)
+                    cv2.imwrite(str(masks / f"{number:06d}.png"), mask)
+                yield frame.image
+                if self.advance is not None:
+                    self.advance(name, number + 1, self.count(name))
 
+        write_video(file, images(), self.fps(name))
+        arrays = {"boxes": np.array(boxes), "visible": np.array(visible)}
+        write_archive(folder / "reference" / "boxes" / f"{name}.npz", arrays)
 
-def _draw_stills(stage: _FilmSet) -> dict[str, Image]:
-    """Return the first image of every static camera."""
-    names = list(stage.scene.cameras)
-    with ThreadPoolExecutor() as pool:  # the renderer's kernels release the GIL
-        drawn = pool.map(lambda name: next(stage.film(name, 1)).image, names)
-        return dict(zip(names, drawn, strict=True))
-
-
-def _key_frames(scenario: Scenario, scene: Scene, seed: int) -> dict[str, KeyFrames]:
-    """Return the annotated key frames of the broadcast cameras' videos, if there are any."""
-    if not scenario.key_frames:
-        return {}
-    painted, rng = PitchTemplate.from_spec(scenario.pitch), np.random.default_rng([seed, 4])
-    clicked = {}
-    for name, view in scene.broadcast.items():
-        is_usual = view.fps == scenario.fps
-        people = scene.truth.joints if is_usual else scene.crowd.joints(view.times)
-        clicked[name] = click_key_frames(
-            view.camera, painted, people, scenario.clicks, scenario.key_frames, rng
+    def _write_truth(self, folder: Path) -> None:
+        """Write the ground truth, with its detections' persons if there are detections."""
+        scene, is_detected = self.scene, not self.options.render
+        points = {name: tuple(place) for name, place in self.pitch.points.items()}
+        clicks = {
+            name: {"wrong": dict(each.wrong), "clustered": each.clustered}
+            for name, each in scene.clicks.items()
+        }
+        write_reference(
+            folder,
+            scene.truth,
+            scene.defined if is_detected else None,
+            scene.cameras,
+            scene.identities if is_detected else {},
+            {"clocks": scene.clocks, "clicks": clicks},
+            self.scenario.pitch.model_copy(update={"points": points}),
         )
-    return clicked
-
-
-def _write_truth(folder: Path, scenario: Scenario, scene: Scene, *, detected: bool) -> None:
-    """Write the ground truth of a scene, with or without its detections' persons."""
-    points = {n: tuple(p) for n, p in PitchTemplate.from_spec(scenario.pitch).points.items()}
-    clicks = {
-        name: {"wrong": dict(each.wrong), "clustered": each.clustered}
-        for name, each in scene.clicks.items()
-    }
-    write_reference(
-        folder,
-        scene.truth,
-        scene.defined if detected else None,
-        scene.cameras,
-        scene.identities if detected else {},
-        {"clocks": scene.clocks, "clicks": clicks},
-        scenario.pitch.model_copy(update={"points": points}),
-    )
-    write_poses(folder / "poses" / f"{CLIP_ID}.npz", scene.poses, OPEN_BODY)
-    for name, view in scene.broadcast.items():
-        write_moving_camera(folder / "cameras" / f"{name}.npz", view.camera[view.number])
+        write_poses(folder / "poses" / f"{CLIP_ID}.npz", scene.poses, OPEN_BODY)
+        for name, view in scene.broadcast.items():
+            write_moving_camera(folder / "cameras" / f"{name}.npz", view.camera[view.number])

@@ -34,7 +34,7 @@ from worldpose.geometry.rasters import (
     resolve,
 )
 from worldpose.pitch.template import PitchTemplate
-from worldpose.simulation.mannequins import Cast, Mannequin, Surfaces, dress_people
+from worldpose.simulation.mannequins import Cast, Mannequin, Role, Surfaces, dress_people
 from worldpose.simulation.settings import RenderingSettings
 from worldpose.simulation.venues import (
     CELL,
@@ -86,8 +86,7 @@ def shade_ground(
     soft = 0.9  # standard deviation of a shadow's rim [px]: some centimetres
     height, width = image.shape[:2]
     mask = np.zeros((height, width), dtype=np.uint8)
-    # Levels of 255 that each combination of lights takes.
-    taken = np.zeros(256, dtype=np.uint8)
+    taken = np.zeros(256, dtype=np.uint8)  # levels that each combination of lights takes
     for index, light in enumerate((*venue.lights, SKY)):
         bit = 1 << index
         taken[[value for value in range(256) if value & bit]] += round(255.0 * float(light[3]))
@@ -138,41 +137,52 @@ class Moment:
     closed: Surfaces
 
 
-def expose(
-    venue: Venue, camera: Camera, scene: Image, grain: NDArray[np.int8], moment: Moment, frame: int
-) -> RenderedFrame:
-    """Return the image of people before a scene.
+@dataclass(frozen=True, eq=False)
+class SceneView:
+    """A camera before an empty stadium.
 
-    `scene` (height, width, 3) is without them, before the lens; it is changed in place. `grain` is
-    of `sensor_grain`; the frame seeds its place.
+    Attributes:
+        venue: the stadium.
+        camera: a single camera.
+        scene: (height, width, 3) RGB, before the lens; without goals.
+        grain: noise of `sensor_grain`.
     """
-    height, width = scene.shape[:2]
-    cast, goals = moment.cast, venue.goals
-    persons = len(cast.shaped)
-    things = [(goals.faces, goals.surfaces.vertices)]
-    things.append((cast.mannequin.faces, moment.opened.vertices))
-    shade_ground(venue, camera, scene, things)
-    drawn, spans, boxes = _outline_surfaces(venue, camera, moment, width, height)
-    ids = np.full((height, width), NOBODY, dtype=np.int16)
-    seen, filled = np.zeros(persons, dtype=np.int64), np.zeros(persons, dtype=np.int64)
-    for (left, top, right, bottom), members in cluster_boxes(spans):
-        samples = Samples.empty(left, top, right, bottom)
-        for number in members:
-            thing = drawn[number]
-            count = draw_triangles(thing, _haze_before(venue, thing.opened), number, samples)
-            if number < persons:
-                filled[number] = count
-        part = (slice(top, bottom), slice(left, right))
-        resolve(samples.who, samples.color, scene[part], ids[part], seen)
-    image = scene
-    if venue.settings.blur_px > 0.0:
-        image = np.asarray(cv2.GaussianBlur(scene, (0, 0), venue.settings.blur_px), np.uint8)
-    rng = np.random.default_rng([venue.seed, 7, frame])
-    down, across = (int(n) for n in rng.integers(_SPARE, size=2))
-    noise = grain[down : down + height, across : across + width]
-    image = np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U), dtype=np.uint8)
-    visible = np.where(filled > 0, seen / np.maximum(filled, 1), 0.0)
-    return RenderedFrame(image, ids, boxes, visible)
+
+    venue: Venue
+    camera: Camera
+    scene: Image
+    grain: NDArray[np.int8]
+
+    def expose(self, moment: Moment, frame: int = 0) -> RenderedFrame:
+        """Return the image of people before the scene; the frame seeds the place of the noise."""
+        venue, scene = self.venue, self.scene.copy()
+        height, width = scene.shape[:2]
+        cast, goals = moment.cast, venue.goals
+        persons = len(cast.shaped)
+        things = [(goals.faces, goals.surfaces.vertices)]
+        things.append((cast.mannequin.faces, moment.opened.vertices))
+        shade_ground(venue, self.camera, scene, things)
+        drawn, spans, boxes = _outline_surfaces(venue, self.camera, moment, width, height)
+        ids = np.full((height, width), NOBODY, dtype=np.int16)
+        seen, filled = np.zeros(persons, dtype=np.int64), np.zeros(persons, dtype=np.int64)
+        for (left, top, right, bottom), members in cluster_boxes(spans):
+            samples = Samples.empty(left, top, right, bottom)
+            for number in members:
+                thing = drawn[number]
+                count = draw_triangles(thing, _haze_before(venue, thing.opened), number, samples)
+                if number < persons:
+                    filled[number] = count
+            part = (slice(top, bottom), slice(left, right))
+            resolve(samples.who, samples.color, scene[part], ids[part], seen)
+        image = scene
+        if venue.settings.blur_px > 0.0:
+            image = np.asarray(cv2.GaussianBlur(scene, (0, 0), venue.settings.blur_px), np.uint8)
+        rng = np.random.default_rng([venue.seed, 7, frame])
+        down, across = (int(n) for n in rng.integers(_SPARE, size=2))
+        noise = self.grain[down : down + height, across : across + width]
+        image = np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U), dtype=np.uint8)
+        visible = np.where(filled > 0, seen / np.maximum(filled, 1), 0.0)
+        return RenderedFrame(image, ids, boxes, visible)
 
 
 def _outline_surfaces(
@@ -218,8 +228,7 @@ def _shade_surfaces(venue: Venue, surfaces: Surfaces) -> Singles:
     ambient = 0.58  # ambient light on an upright surface [1]
     normals, vertices = surfaces.normals, surfaces.vertices
     light = np.float32(ambient) + np.float32(from_above) * normals[..., 2]
-    # Light on a surface that faces a light source, per share of light that its shadow takes [1].
-    direct_light = 1.3
+    direct_light = 1.3  # on a surface that faces a light, per share that its shadow takes [1]
     for way in venue.lights:
         toward = (-way[:3] / np.linalg.norm(way[:3])).astype(np.float32)
         direct = np.float32(direct_light * way[3]) * np.maximum(normals @ toward, np.float32(0.0))
@@ -275,23 +284,6 @@ def sensor_grain(venue: Venue, camera: Camera) -> NDArray[np.int8]:
     return np.repeat(levels.astype(np.int8)[..., None], 3, axis=2)
 
 
-@dataclass(frozen=True, eq=False)
-class SceneView:
-    """A static camera before an empty stadium.
-
-    Attributes:
-        venue: the stadium.
-        camera: a single camera.
-        scene: (height, width, 3) RGB, before the lens; without goals.
-        grain: noise of the sensor.
-    """
-
-    venue: Venue
-    camera: Camera
-    scene: Image
-    grain: NDArray[np.int8]
-
-
 def open_view(
     camera: Camera, pitch: PitchTemplate, seed: int, settings: RenderingSettings | None = None
 ) -> SceneView:
@@ -303,17 +295,6 @@ def open_view(
     return SceneView(venue, camera, paint_empty(venue, camera), sensor_grain(venue, camera))
 
 
-def render_frame(
-    view: SceneView, cast: Cast, opened: Surfaces, closed: Surfaces | None = None, *, frame: int = 0
-) -> RenderedFrame:
-    """Return one image of people; the same arguments give the same bytes.
-
-    `closed` are the surfaces when the shutter closes; None = no motion. The frame seeds the noise.
-    """
-    moment = Moment(cast, opened, closed or opened)
-    return expose(view.venue, view.camera, view.scene.copy(), view.grain, moment, frame)
-
-
 def render_pitch(
     camera: Camera,
     pitch: PitchTemplate,
@@ -323,13 +304,8 @@ def render_pitch(
 ) -> Image:
     """Return one image (height, width, 3) in RGB; the same arguments give the same bytes.
 
-    Painted lines are `LINE_WIDTH` wide with the template's lines in their middle.
-
-    `people` are bodies (persons,), world; None = nobody. The seed is that of the stadium's look,
-    kits and noise.
-
-    Raises:
-        InputError: a batch of cameras.
+    Painted lines are `LINE_WIDTH` wide with the template's lines in their middle. `people` are
+    bodies (persons,), world. The seed is that of the stadium's look, kits and noise.
     """
     if camera.batch_shape:
         raise InputError(
@@ -338,17 +314,12 @@ def render_pitch(
             found=f"a batch of shape {camera.batch_shape}",
             todo="Pass one camera of the batch, for example cameras[0].",
         )
-    people = _NO_PEOPLE if people is None else people
-    cast = _dress(people.betas, seed)
-    return render_frame(open_view(camera, pitch, seed, settings), cast, cast.pose(people)).image
-
-
-_NO_PEOPLE: Final = BodyParameters(*(np.empty((0, n)) for n in (10, 3, BODY_POSE, 3)))
-
-
-def _dress(betas: Floats, seed: int) -> Cast:
-    """Return people (persons, 10) of two teams."""
-    return dress_people(betas, [("first", "second")[n % 2] for n in range(len(betas))], seed)
+    if people is None:
+        people = BodyParameters(*(np.empty((0, n)) for n in (10, 3, BODY_POSE, 3)))
+    roles: list[Role] = [("first", "second")[n % 2] for n in range(len(people.betas))]
+    cast = dress_people(people.betas, roles, seed)
+    posed = cast.pose(people)
+    return open_view(camera, pitch, seed, settings).expose(Moment(cast, posed, posed)).image
 
 
 _FINER: Final = 1.15
@@ -391,8 +362,7 @@ def render_panorama(cameras: Camera, venue: Venue) -> Panorama:
         )
     pan, rise = _field_of_view(cameras)
     scale = _FINER * float(cameras.focal.max())
-    # Margin around the frames' field of view [rad].
-    margin_rad = 0.01
+    margin_rad = 0.01  # around the frames' field of view [rad]
     left, top = pan[0] - margin_rad, rise[1] + margin_rad
     width = int(np.ceil((pan[1] + margin_rad - left) * scale))
     height = int(np.ceil((top - rise[0] + margin_rad) * scale))
@@ -418,7 +388,7 @@ def render_panorama(cameras: Camera, venue: Venue) -> Panorama:
 def film_broadcast(
     cameras: Camera, venue: Venue, moments: Iterable[Moment]
 ) -> Iterator[RenderedFrame]:
-    """Yield a clip's frames, like `render_frame`.
+    """Yield a clip's frames.
 
     `cameras` is a batch (frames,) with one center; `moments` are the people in every frame.
 
@@ -430,7 +400,7 @@ def film_broadcast(
     width, height = (int(n) for n in cameras.image_size.reshape(-1, 2)[0])
     for frame, moment in enumerate(moments):
         scene = _sample_panorama(panorama, cameras[frame], width, height)
-        yield expose(venue, cameras[frame], scene, grain, moment, frame)
+        yield SceneView(venue, cameras[frame], scene, grain).expose(moment, frame)
 
 
 def _field_of_view(cameras: Camera) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -446,8 +416,7 @@ def _field_of_view(cameras: Camera) -> tuple[tuple[float, float], tuple[float, f
 
 def _sample_panorama(panorama: Panorama, camera: Camera, width: int, height: int) -> Image:
     """Return a camera's image of a panorama (height, width, 3)."""
-    # Grid spacing of a frame's lens inversion [px]: between the nodes its error is 0.005 px.
-    grid_px = 8
+    grid_px = 8  # spacing of the lens inversion [px]: between the nodes its error is 0.005 px
     columns, rows = -(-width // grid_px) + 1, -(-height // grid_px) + 1
     # With this offset, enlarging the grid puts its first entry on the first pixel.
     u = np.arange(columns) * grid_px + 0.5 * (grid_px - 1.0)

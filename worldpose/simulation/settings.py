@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Final, Literal, get_args
 
 from pydantic import Field
@@ -248,3 +250,38 @@ class Scenario(Record):
     survey_error: float = Field(default=0.006, ge=0, le=1)
     """Error of the points in pitch.json, standard deviation along each axis [m], together about 1
     cm: a total station measures to millimetres, but the middle of a painted corner is ambiguous."""
+
+
+@dataclass(frozen=True)
+class MatchOptions:
+    """Changes of a simulated match to its scenario, and the files to write."""
+
+    duration: float | None = None
+    """[s], instead of the scenario's."""
+    cameras: int | None = None
+    """Number of static cameras, instead of the scenario's."""
+    players: int | None = None
+    """Number of people, instead of the scenario's."""
+    trajectories: Path | None = None
+    """Tracking data (`read_trajectories`) that drives the people instead; the clip ends with it."""
+    mocap: Path | None = None
+    """Motion capture (`worldpose.simulation.recordings.read_clip`) that one person plays."""
+    calibrated: bool = False
+    """Write the true static cameras as calibration.toml; without, the folder has such a file only
+    if the scenario has calibration errors."""
+    stills: bool = True
+    """Add one image of every static camera, about a second each."""
+    video: bool = True
+    """If the scenario has key frames, add the broadcast camera's video, about 0.1 s per frame,
+    annotated key frames, and bodies from a simulated monocular method (`estimates/`)."""
+    render: bool = False
+    """Film all cameras, and write no detections, so that pixels are the only input."""
+    masks: bool = False
+    """Add person masks of all filmed frames."""
+
+    def name(self, scenario: str, seed: int, *replayed: str) -> str:
+        """Return the id of a match: scenario, seed and its changes, as by replayed recordings."""
+        sizes = ((self.duration, "s"), (self.cameras, "cameras"), (self.players, "players"))
+        changes = [f"{value:g}{unit}" for value, unit in sizes if value is not None]
+        changes += [*replayed, *["calibrated"] * self.calibrated]
+        return "-".join([scenario, str(seed), *changes])

@@ -125,7 +125,7 @@ class FrameIndex:
 
 
 def _count_dropped(steps: Floats) -> int:
-    """Return how many frames a recorder of the clock's rate left out, by steps of images [frame]."""
+    """Return how many frames a recorder of the clock's rate left out, by images' steps [frame]."""
     if not len(steps) or abs(float(np.median(steps)) - 1.0) > RATE_SLACK:
         return 0
     whole = np.rint(steps)

@@ -109,7 +109,7 @@ def test_no_module_imports_motion_noise_or_cameras_of_the_first_world():
 @pytest.mark.parametrize("name", FOREIGN_SCENARIOS)
 def test_every_scenario_makes_a_match_that_the_factory_takes(tmp_path, name):
     scenario = FOREIGN_SCENARIOS[name]
-    spec = simulate_foreign_match(scenario, 7, tmp_path / "match", duration=0.2)
+    spec = simulate_foreign_match(scenario, 7, tmp_path / "match", MatchOptions(duration=0.2))
     match = read_match(tmp_path / "match")
     assert match.spec == spec
     assert scenario.cameras[0] <= len(spec.cameras) <= scenario.cameras[1]

@@ -144,17 +144,12 @@ _EASE: Final = np.array(
 )
 """Error of each joint relative to the average one [1]."""
 
-_STICKMAN: Final = (
-    np.array(
-        [
-            *([0.0, 0.02, -0.02, 0.04, -0.04, 0.1, -0.1, 0.12, -0.12, 0.12, -0.12]),
-            *([0.06, -0.06, 0.07, -0.07, 0.07, -0.07]),
-            *([0.07, 0.05, 0.05, 0.06, 0.06, 0.18, 0.18, 0.34, 0.34, 0.48, 0.48]),
-            *([0.5, 0.5, 0.74, 0.74, 0.95, 0.95]),
-        ]
-    )
-    .reshape(2, 17)
-    .T
+_STICKMAN: Final = np.array(
+    [
+        *([0.0, 0.07], [0.02, 0.05], [-0.02, 0.05], [0.04, 0.06], [-0.04, 0.06]),
+        *([0.1, 0.18], [-0.1, 0.18], [0.12, 0.34], [-0.12, 0.34], [0.12, 0.48], [-0.12, 0.48]),
+        *([0.06, 0.5], [-0.06, 0.5], [0.07, 0.74], [-0.07, 0.74], [0.07, 0.95], [-0.07, 0.95]),
+    ]
 )
 """Across and down, of a person of height one who faces the camera."""
 
@@ -176,279 +171,238 @@ class Detector:
     view_bias: Floats
     height_bias: Floats
 
+    @classmethod
+    def draw(cls, profile: DetectorProfile, rng: np.random.Generator) -> Detector:
+        """Return a detector of this profile; left and right are mirror images."""
+        definition = profile.definition * rng.standard_normal((17, 3))
+        height_bias = profile.height_bias * rng.standard_normal(17)
+        for joint, mirror in enumerate(COCO17_FLIP):
+            if mirror < joint:
+                definition[joint] = definition[mirror] * [1.0, -1.0, 1.0]
+                height_bias[joint] = height_bias[mirror]
+        definition[0, 1] = 0.0
+        view_bias = profile.view_bias * rng.standard_normal((17, 2, 4))
+        return cls(profile, definition, view_bias, height_bias)
 
-def draw_detector(profile: DetectorProfile, rng: np.random.Generator) -> Detector:
-    """Return a detector of this profile; left and right are mirror images."""
-    definition = profile.definition * rng.standard_normal((17, 3))
-    height_bias = profile.height_bias * rng.standard_normal(17)
-    for joint, mirror in enumerate(COCO17_FLIP):
-        if mirror < joint:
-            definition[joint] = definition[mirror] * [1.0, -1.0, 1.0]
-            height_bias[joint] = height_bias[mirror]
-    definition[0, 1] = 0.0
-    view_bias = profile.view_bias * rng.standard_normal((17, 2, 4))
-    return Detector(profile, definition, view_bias, height_bias)
+    def define(self, joints: Floats, personal: Floats) -> Floats:
+        """Return the joints as the detector defines them (frames, persons, 17, 3) [m], world.
 
-
-def defined_joints(joints: Floats, detector: Detector, personal: Floats) -> Floats:
-    """Return the joints as the detector defines them (frames, persons, 17, 3) [m], world.
-
-    `personal` (persons, 17, 3) are each person's own offsets, in units of the profile's.
-    """
-    _, left = facing_axes(joints)
-    along = joints - joints[:, :, _PARENT]
-    along = along / np.linalg.norm(along, axis=-1, keepdims=True)
-    side = left[:, :, None] - (left[:, :, None] * along).sum(-1, keepdims=True) * along
-    # An arm stretched out sideways has no left direction of its own.
-    side = side / np.maximum(np.linalg.norm(side, axis=-1, keepdims=True), 0.2)
-    offset = detector.definition + detector.profile.personal * personal
-    moved = joints + offset[..., :1] * along + offset[..., 1:2] * side
-    moved = moved + offset[..., 2:] * np.cross(along, side)
-    outward = np.array([1.0, -1.0])[:, None] * left[:, :, None]
-    hips = detector.profile.wide_hips * outward
-    hips[..., 2] -= detector.profile.low_hips
-    moved[:, :, 11:13] += hips
-    return np.asarray(moved)
-
-
-def detect_people(
-    detector: Detector,
-    view: ForeignView,
-    defined: Floats,
-    image_size: Integers,
-    fps: float,
-    lost: float,
-    rng: np.random.Generator,
-) -> Report:
-    """Return the detections in a camera's images.
-
-    `defined` (frames, persons, 17, 2) are pixels of the joints as the detector defines them, `lost`
-    is the share of frames that the camera lost.
-    """
-    profile = detector.profile
-    frames, persons = view.size.shape
-    size = np.nan_to_num(view.size, nan=1.0)
-    spread = profile.noise * size * (size / 100.0) ** -0.3
-    spread = np.hypot(spread, profile.floor)[..., None] * _EASE
-    hidden = (view.hider >= 0) | view.behind_self
-    error = _draw_errors(profile, frames, persons, fps, rng) * spread[..., None]
-    error *= np.where(hidden, 2.0, 1.0)[..., None]
-    known = np.linalg.norm(error, axis=-1) / size[..., None]
-    error = error + _bias(detector, view, size)
-    keypoints = defined + error
-    keypoints, strayed = _misplace_joints(profile, keypoints, view, fps, rng)
-    keypoints = _swap_sides(profile, keypoints, view, fps, rng)
-    if profile.grid > 0.0:
-        cell = profile.grid * size[..., None, None]
-        keypoints = np.round(keypoints / cell) * cell
-
-    luck = rng.random((frames, persons, 17))
-    there = view.inside & np.where(hidden, luck < profile.hidden_kept, luck > profile.joint_missed)
-    there &= np.isfinite(keypoints).all(axis=-1)
-    found = rng.random(persons) < 1.0 / (1.0 + (profile.smallest / np.maximum(size, 1.0)) ** 6)
-    found &= ~_draw_bursts(profile.person_missed, 0.25, (frames, persons), fps, rng)
-    found &= (view.hider >= 0).mean(axis=-1) < 0.75
-    keypoints, there, found = _merge_people(profile, keypoints, there, found, view, fps, rng)
-    found &= there.sum(axis=-1) >= 4
-    if lost > 0.0:
-        found &= ~_draw_bursts(lost, 0.1, (frames, 1), fps, rng)
-    confidence = _draw_confidence(profile, known, hidden, rng)
-    false, sure = _draw_false_positives(profile, size, image_size, frames, rng)
-    doubles = found & (rng.random(found.shape) < profile.duplicates)
-    again = keypoints + 0.5 * spread[..., None] * rng.standard_normal(keypoints.shape)
-    keypoints = np.concatenate([keypoints, again, false], axis=1)
-    confidence = np.concatenate([confidence, 0.8 * confidence, sure], axis=1)
-    there = np.concatenate([there, there, np.isfinite(false[..., 0])], axis=1)
-    found = np.concatenate([found, doubles, np.isfinite(false[..., 0]).any(-1)], axis=1)
-    whose = np.concatenate([np.arange(persons), np.arange(persons), np.full(false.shape[1], -1)])
-    displaced = np.concatenate([strayed, strayed, np.zeros(false.shape[:3], np.bool_)], axis=1)
-    there &= found[..., None]
-    keypoints = np.where(there[..., None], keypoints, np.nan)
-    confidence = np.where(there, np.clip(confidence, 0.01, 1.0), np.nan)
-
-    def box(order: Integers, places: Floats, found: Flags) -> Floats:
-        low = np.where(np.isfinite(places), places, np.inf).min(axis=2, initial=np.inf)
-        high = np.where(np.isfinite(places), places, -np.inf).max(axis=2, initial=-np.inf)
-        tall = np.where(found[..., None], high - low, 0.0)
-        room = rng.uniform(0.02, 0.12, (*found.shape, 2)) * tall + 1.0
-        return np.concatenate([low - room, high + room], axis=-1)
-
-    return list_detections(keypoints, confidence, displaced & there, whose, box, rng)
+        `personal` (persons, 17, 3) are each person's own offsets, in units of the profile's.
+        """
+        _, left = facing_axes(joints)
+        along = joints - joints[:, :, _PARENT]
+        along = along / np.linalg.norm(along, axis=-1, keepdims=True)
+        side = left[:, :, None] - (left[:, :, None] * along).sum(-1, keepdims=True) * along
+        # An arm stretched out sideways has no left direction of its own.
+        side = side / np.maximum(np.linalg.norm(side, axis=-1, keepdims=True), 0.2)
+        offset = self.definition + self.profile.personal * personal
+        moved = joints + offset[..., :1] * along + offset[..., 1:2] * side
+        moved = moved + offset[..., 2:] * np.cross(along, side)
+        outward = np.array([1.0, -1.0])[:, None] * left[:, :, None]
+        hips = self.profile.wide_hips * outward
+        hips[..., 2] -= self.profile.low_hips
+        moved[:, :, 11:13] += hips
+        return np.asarray(moved)
 
 
-def _draw_errors(
-    profile: DetectorProfile, frames: int, persons: int, fps: float, rng: np.random.Generator
-) -> Floats:
-    """Return unit errors (frames, persons, 17, 2): resonant, sudden, and shared along limbs."""
-    from scipy.signal import lfilter  # late: it takes a second, and lists of scenarios need none
+@dataclass(frozen=True, eq=False)
+class Filming:
+    """A detector before one camera's images, at a frame rate [1/s]; `rng` draws its errors."""
 
-    shape = (persons, 17, 2)
-    lead = round(2.0 * fps)
-    driven = rng.standard_normal((frames + lead, *shape))
-    swinging = np.empty(driven.shape)
-    for joint in range(17):
-        period = rng.uniform(*profile.resonance)
-        decay = np.exp(-1.0 / (0.7 * period * fps))
-        turn = 2.0 * np.pi / max(period * fps, 4.0)
-        poles = [1.0, -2.0 * decay * np.cos(turn), decay**2]
-        swinging[:, :, joint] = lfilter([1.0], poles, driven[:, :, joint], axis=0)
-    swinging = swinging[lead:] / swinging[lead:].std(axis=(0, 1, 3), keepdims=True)
-    jumps = np.clip(rng.standard_t(profile.tail, (frames, *shape)), -15.0, 15.0)
-    jumps /= np.sqrt(profile.tail / (profile.tail - 2.0))
-    own = np.sqrt(1.0 - profile.sudden) * swinging + np.sqrt(profile.sudden) * jumps
-    for joint in (7, 8, 9, 10, 13, 14, 15, 16):
-        mixed = profile.limbs * own[:, :, _PARENT[joint]] + own[:, :, joint]
-        own[:, :, joint] = mixed / np.hypot(1.0, profile.limbs)
-    return np.asarray(own)
+    detector: Detector
+    view: ForeignView
+    image_size: Integers
+    fps: float
+    rng: np.random.Generator
 
+    @property
+    def profile(self) -> DetectorProfile:
+        """Rates and spreads."""
+        return self.detector.profile
 
-def _bias(detector: Detector, view: ForeignView, size: Floats) -> Floats:
-    """Return the bias (frames, persons, 17, 2) [px] by azimuth and elevation of the camera."""
-    azimuth = view.azimuth
-    waves = [np.cos(azimuth), np.sin(azimuth), np.cos(3.0 * azimuth), np.sin(3.0 * azimuth)]
-    bias = np.einsum("fpw,jaw->fpja", np.stack(waves, axis=-1), detector.view_bias)
-    bias[..., 1] += np.sin(view.elevation)[..., None] * detector.height_bias
-    return np.asarray(bias * size[..., None, None])
+    def detect(self, defined: Floats, lost: float) -> Report:
+        """Return the detections.
 
+        `defined` (frames, persons, 17, 2) are pixels of the joints as the detector defines them,
+        `lost` is the share of frames that the camera lost.
+        """
+        profile, view, rng = self.profile, self.view, self.rng
+        frames, persons = view.size.shape
+        size = np.nan_to_num(view.size, nan=1.0)
+        spread = profile.noise * size * (size / 100.0) ** -0.3
+        spread = np.hypot(spread, profile.floor)[..., None] * _EASE
+        hidden = (view.hider >= 0) | view.behind_self
+        error = self._draw_errors(frames, persons) * spread[..., None]
+        error *= np.where(hidden, 2.0, 1.0)[..., None]
+        known = np.linalg.norm(error, axis=-1) / size[..., None]
+        error = error + self._bias(size)
+        keypoints = defined + error
+        keypoints, strayed = self._misplace_joints(keypoints)
+        keypoints = self._swap_sides(keypoints)
+        if profile.grid > 0.0:
+            cell = profile.grid * size[..., None, None]
+            keypoints = np.round(keypoints / cell) * cell
 
-def _misplace_joints(
-    profile: DetectorProfile,
-    keypoints: Floats,
-    view: ForeignView,
-    fps: float,
-    rng: np.random.Generator,
-) -> tuple[Floats, Flags]:
-    """Return keypoints with gross errors in bursts, and their flags."""
-    shape = keypoints.shape[:3]
-    away = _draw_bursts(profile.strayed, 0.12, shape, fps, rng)
-    # A joint behind another person more often gets that person's position.
-    away |= (view.hider >= 0) & _draw_bursts(6.0 * profile.strayed, 0.15, shape, fps, rng)
-    frame, person, joint = np.nonzero(away)
-    kind = rng.integers(3, size=len(frame))
-    hider = view.hider[frame, person, joint]
-    kind = np.where((hider >= 0) & (rng.random(len(frame)) < 0.7), 3, kind)
-    parents, others = np.array(_PARENT), np.array(COCO17_FLIP)
-    share = rng.uniform(0.3, 0.9, len(frame))[:, None]
-    here = keypoints[frame, person, joint]
-    parent = keypoints[frame, person, parents[joint]]
-    angle = rng.uniform(0.0, 2.0 * np.pi, len(frame))
-    throw = 0.25 * view.size[frame, person] * rng.uniform(0.3, 1.0, len(frame))
-    targets = [
-        keypoints[frame, person, others[joint]],
-        share * parent + (1.0 - share) * here,
-        here + throw[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1),
-        keypoints[frame, np.maximum(hider, 0), joint],
-    ]
-    moved = keypoints.copy()
-    moved[frame, person, joint] = np.choose(kind[:, None], targets)
-    return moved, away
+        luck = rng.random((frames, persons, 17))
+        shown = np.where(hidden, luck < profile.hidden_kept, luck > profile.joint_missed)
+        there = view.inside & shown & np.isfinite(keypoints).all(axis=-1)
+        found = rng.random(persons) < 1.0 / (1.0 + (profile.smallest / np.maximum(size, 1.0)) ** 6)
+        found &= ~self._draw_bursts(profile.person_missed, 0.25, (frames, persons))
+        found &= (view.hider >= 0).mean(axis=-1) < 0.75
+        self._merge_people(keypoints, there, found)
+        found &= there.sum(axis=-1) >= 4
+        if lost > 0.0:
+            found &= ~self._draw_bursts(lost, 0.1, (frames, 1))
+        confidence = self._draw_confidence(known, hidden)
+        false, sure = self._draw_false_positives(size)
+        doubles = found & (rng.random(found.shape) < profile.duplicates)
+        again = keypoints + 0.5 * spread[..., None] * rng.standard_normal(keypoints.shape)
+        keypoints = np.concatenate([keypoints, again, false], axis=1)
+        confidence = np.concatenate([confidence, 0.8 * confidence, sure], axis=1)
+        shown = np.isfinite(false[..., 0])
+        there = np.concatenate([there, there, shown], axis=1)
+        found = np.concatenate([found, doubles, shown.any(-1)], axis=1)
+        whose = np.concatenate([*2 * [np.arange(persons)], np.full(false.shape[1], -1)])
+        displaced = np.concatenate([strayed, strayed, np.zeros_like(shown)], axis=1)
+        there &= found[..., None]
+        keypoints = np.where(there[..., None], keypoints, np.nan)
+        confidence = np.where(there, np.clip(confidence, 0.01, 1.0), np.nan)
 
+        def box(order: Integers, places: Floats, found: Flags) -> Floats:
+            low = np.where(np.isfinite(places), places, np.inf).min(axis=2, initial=np.inf)
+            high = np.where(np.isfinite(places), places, -np.inf).max(axis=2, initial=-np.inf)
+            tall = np.where(found[..., None], high - low, 0.0)
+            room = rng.uniform(0.02, 0.12, (*found.shape, 2)) * tall + 1.0
+            return np.concatenate([low - room, high + room], axis=-1)
 
-def _swap_sides(
-    profile: DetectorProfile,
-    keypoints: Floats,
-    view: ForeignView,
-    fps: float,
-    rng: np.random.Generator,
-) -> Floats:
-    """Return keypoints with left-right swaps of parts in bursts, more often from behind."""
-    swapped = keypoints.copy()
-    # Joints that are swapped left to right together.
-    parts = ((1, 2, 3, 4), (5, 6, 7, 8, 9, 10), (11, 12, 13, 14, 15, 16))
-    for part in (*parts, tuple(range(17))):
-        on = _draw_bursts(0.5 * profile.swapped, 0.2, view.size.shape, fps, rng)
-        more = _draw_bursts(profile.swapped, 0.2, view.size.shape, fps, rng)
-        on |= more & (np.cos(view.azimuth) < 0.0)
-        frame, person = np.nonzero(on)
-        joints = np.array(part)
-        mirror = np.array(COCO17_FLIP)[joints]
-        swapped[frame[:, None], person[:, None], joints] = keypoints[
-            frame[:, None], person[:, None], mirror
+        return list_detections(keypoints, confidence, displaced & there, whose, box, rng)
+
+    def _draw_errors(self, frames: int, persons: int) -> Floats:
+        """Return unit errors (frames, persons, 17, 2): resonant, sudden, and shared along limbs."""
+        from scipy.signal import (
+            lfilter,  # late: it takes a second, and lists of scenarios need none
+        )
+
+        profile, rng, shape = self.profile, self.rng, (persons, 17, 2)
+        lead = round(2.0 * self.fps)
+        driven = rng.standard_normal((frames + lead, *shape))
+        swinging = np.empty(driven.shape)
+        for joint in range(17):
+            period = rng.uniform(*profile.resonance)
+            decay = np.exp(-1.0 / (0.7 * period * self.fps))
+            turn = 2.0 * np.pi / max(period * self.fps, 4.0)
+            poles = [1.0, -2.0 * decay * np.cos(turn), decay**2]
+            swinging[:, :, joint] = lfilter([1.0], poles, driven[:, :, joint], axis=0)
+        swinging = swinging[lead:] / swinging[lead:].std(axis=(0, 1, 3), keepdims=True)
+        jumps = np.clip(rng.standard_t(profile.tail, (frames, *shape)), -15.0, 15.0)
+        jumps /= np.sqrt(profile.tail / (profile.tail - 2.0))
+        own = np.sqrt(1.0 - profile.sudden) * swinging + np.sqrt(profile.sudden) * jumps
+        for joint in (7, 8, 9, 10, 13, 14, 15, 16):
+            mixed = profile.limbs * own[:, :, _PARENT[joint]] + own[:, :, joint]
+            own[:, :, joint] = mixed / np.hypot(1.0, profile.limbs)
+        return np.asarray(own)
+
+    def _bias(self, size: Floats) -> Floats:
+        """Return the bias (frames, persons, 17, 2) [px] by azimuth and elevation of the camera."""
+        azimuth = self.view.azimuth
+        waves = [np.cos(azimuth), np.sin(azimuth), np.cos(3.0 * azimuth), np.sin(3.0 * azimuth)]
+        bias = np.einsum("fpw,jaw->fpja", np.stack(waves, axis=-1), self.detector.view_bias)
+        bias[..., 1] += np.sin(self.view.elevation)[..., None] * self.detector.height_bias
+        return np.asarray(bias * size[..., None, None])
+
+    def _misplace_joints(self, keypoints: Floats) -> tuple[Floats, Flags]:
+        """Return keypoints with gross errors in bursts, and their flags."""
+        view, rng, shape = self.view, self.rng, keypoints.shape[:3]
+        away = self._draw_bursts(self.profile.strayed, 0.12, shape)
+        # A joint behind another person more often gets that person's position.
+        away |= (view.hider >= 0) & self._draw_bursts(6.0 * self.profile.strayed, 0.15, shape)
+        frame, person, joint = np.nonzero(away)
+        kind = rng.integers(3, size=len(frame))
+        hider = view.hider[frame, person, joint]
+        kind = np.where((hider >= 0) & (rng.random(len(frame)) < 0.7), 3, kind)
+        parents, others = np.array(_PARENT), np.array(COCO17_FLIP)
+        share = rng.uniform(0.3, 0.9, len(frame))[:, None]
+        here = keypoints[frame, person, joint]
+        parent = keypoints[frame, person, parents[joint]]
+        angle = rng.uniform(0.0, 2.0 * np.pi, len(frame))
+        throw = 0.25 * view.size[frame, person] * rng.uniform(0.3, 1.0, len(frame))
+        targets = [
+            keypoints[frame, person, others[joint]],
+            share * parent + (1.0 - share) * here,
+            here + throw[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1),
+            keypoints[frame, np.maximum(hider, 0), joint],
         ]
-    return swapped
+        moved = keypoints.copy()
+        moved[frame, person, joint] = np.choose(kind[:, None], targets)
+        return moved, away
 
+    def _swap_sides(self, keypoints: Floats) -> Floats:
+        """Return keypoints with left-right swaps of parts in bursts, more often from behind."""
+        swapped, shape = keypoints.copy(), self.view.size.shape
+        for part in (slice(1, 5), slice(5, 11), slice(11, 17), slice(0, 17)):
+            on = self._draw_bursts(0.5 * self.profile.swapped, 0.2, shape)
+            more = self._draw_bursts(self.profile.swapped, 0.2, shape)
+            on |= more & (np.cos(self.view.azimuth) < 0.0)
+            swapped[on, part] = keypoints[on][:, COCO17_FLIP[part]]
+        return swapped
 
-def _merge_people(
-    profile: DetectorProfile,
-    keypoints: Floats,
-    there: Flags,
-    found: Flags,
-    view: ForeignView,
-    fps: float,
-    rng: np.random.Generator,
-) -> tuple[Floats, Flags, Flags]:
-    """Merge two people who overlap: half of the joints of each."""
-    frames, persons = found.shape
-    keypoints, there, found = keypoints.copy(), there.copy(), found.copy()
-    merging = _draw_bursts(profile.merged, 0.3, (frames, persons), fps, rng)
-    crowded = (view.hider >= 0).mean(axis=-1) > 0.4
-    for frame, person in np.argwhere(merging & crowded & found):
-        hiders = view.hider[frame, person]
-        before = int(np.bincount(hiders[hiders >= 0]).argmax())
-        if not found[frame, before]:
-            continue
-        half = slice(0, 11) if rng.random() < 0.5 else slice(11, 17)
-        keypoints[frame, before, half] = keypoints[frame, person, half]
-        there[frame, before, half] = there[frame, person, half]
-        found[frame, person] = False
-    return keypoints, there, found
+    def _merge_people(self, keypoints: Floats, there: Flags, found: Flags) -> None:
+        """Merge two people who overlap, in place: half of the joints of each."""
+        merging = self._draw_bursts(self.profile.merged, 0.3, found.shape)
+        crowded = (self.view.hider >= 0).mean(axis=-1) > 0.4
+        for frame, person in np.argwhere(merging & crowded & found):
+            hiders = self.view.hider[frame, person]
+            before = int(np.bincount(hiders[hiders >= 0]).argmax())
+            if not found[frame, before]:
+                continue
+            half = slice(0, 11) if self.rng.random() < 0.5 else slice(11, 17)
+            keypoints[frame, before, half] = keypoints[frame, person, half]
+            there[frame, before, half] = there[frame, person, half]
+            found[frame, person] = False
 
+    def _draw_confidence(self, known: Floats, hidden: Flags) -> Floats:
+        """Return confidence (frames, persons, 17); biases, gross errors and swaps keep it."""
+        luck, kind = self.rng.standard_normal(known.shape), self.profile.confidence
+        honest = 1.0 / (1.0 + (known / 0.06) ** 2) * np.where(hidden, 0.6, 1.0) + 0.06 * luck
+        if kind == "honest":
+            return np.asarray(honest)
+        if kind == "meek":
+            return np.asarray(0.1 + 0.35 * np.clip(honest, 0.0, 1.0))
+        if kind == "sure":
+            return np.asarray(np.minimum(0.96 + 0.02 * luck, 1.0) - 0.05 * hidden)
+        return np.asarray(self.rng.beta(4.0, 2.0, known.shape))
 
-def _draw_confidence(
-    profile: DetectorProfile, known: Floats, hidden: Flags, rng: np.random.Generator
-) -> Floats:
-    """Return confidence (frames, persons, 17); biases, gross errors and swaps do not lower it."""
-    luck = rng.standard_normal(known.shape)
-    honest = 1.0 / (1.0 + (known / 0.06) ** 2) * np.where(hidden, 0.6, 1.0) + 0.06 * luck
-    if profile.confidence == "honest":
-        return np.asarray(honest)
-    if profile.confidence == "meek":
-        return np.asarray(0.1 + 0.35 * np.clip(honest, 0.0, 1.0))
-    if profile.confidence == "sure":
-        return np.asarray(np.minimum(0.96 + 0.02 * luck, 1.0) - 0.05 * hidden)
-    return np.asarray(rng.beta(4.0, 2.0, known.shape))
+    def _draw_false_positives(self, size: Floats) -> tuple[Floats, Floats]:
+        """Return keypoints (frames, false, 17, 2) of false positives, and their confidence."""
+        rng, frames, usual = self.rng, len(size), float(np.median(size))
+        ghosts = int(rng.poisson(self.profile.ghosts))
+        flashes = rng.poisson(self.profile.flashes, frames)
+        count = ghosts + int(flashes.max(initial=0))
+        places = np.full((frames, count, 17, 2), np.nan)
 
+        def figure(rows: int) -> Floats:
+            tall = usual * rng.lognormal(0.0, 0.35)
+            middle = rng.uniform(0.05, 0.9, 2) * self.image_size
+            warped = _STICKMAN * rng.uniform(0.6, 1.4, (17, 2)) * tall + middle
+            return np.asarray(warped + 0.02 * tall * rng.standard_normal((rows, 17, 2)))
 
-def _draw_false_positives(
-    profile: DetectorProfile,
-    size: Floats,
-    image_size: Integers,
-    frames: int,
-    rng: np.random.Generator,
-) -> tuple[Floats, Floats]:
-    """Return keypoints (frames, false, 17, 2) of false positives, and their confidence."""
-    ghosts = int(rng.poisson(profile.ghosts))
-    flashes = rng.poisson(profile.flashes, frames)
-    count = ghosts + int(flashes.max(initial=0))
-    places = np.full((frames, count, 17, 2), np.nan)
-    usual = float(np.median(size))
+        for ghost in range(ghosts):
+            shown = rng.random(frames) < rng.uniform(0.3, 0.95)
+            places[:, ghost] = np.where(shown[:, None, None], figure(frames), np.nan)
+        for frame in np.flatnonzero(flashes):
+            for flash in range(flashes[frame]):
+                places[frame, ghosts + flash] = figure(1)[0]
+        outside = ((places < 0.0) | (places > self.image_size - 1.0)).any(axis=-1)
+        places[outside] = np.nan
+        return places, rng.uniform(0.15, 0.8, places.shape[:3])
 
-    def figure(rows: int) -> Floats:
-        tall = usual * rng.lognormal(0.0, 0.35)
-        middle = rng.uniform(0.05, 0.9, 2) * image_size
-        warped = _STICKMAN * rng.uniform(0.6, 1.4, (17, 2)) * tall + middle
-        return np.asarray(warped + 0.02 * tall * rng.standard_normal((rows, 17, 2)))
-
-    for ghost in range(ghosts):
-        shown = rng.random(frames) < rng.uniform(0.3, 0.95)
-        places[:, ghost] = np.where(shown[:, None, None], figure(frames), np.nan)
-    for frame in np.flatnonzero(flashes):
-        for flash in range(flashes[frame]):
-            places[frame, ghosts + flash] = figure(1)[0]
-    outside = ((places < 0.0) | (places > image_size - 1.0)).any(axis=-1)
-    places[outside] = np.nan
-    return places, rng.uniform(0.15, 0.8, places.shape[:3])
-
-
-def _draw_bursts(
-    share: float, length: float, shape: tuple[int, ...], fps: float, rng: np.random.Generator
-) -> Flags:
-    """Return flags set for a share of the first dimension, in bursts of a mean duration [s]."""
-    stop = min(1.0, 1.0 / max(length * fps, 1.0))
-    begin = min(1.0, stop * share / max(1.0 - share, 1e-9))
-    luck = rng.random(shape)
-    on = np.empty(shape, np.bool_)
-    on[0] = luck[0] < share
-    for row in range(1, shape[0]):
-        on[row] = np.where(on[row - 1], luck[row] >= stop, luck[row] < begin)
-    return on
+    def _draw_bursts(self, share: float, length: float, shape: tuple[int, ...]) -> Flags:
+        """Return flags set for a share of the first dimension, in bursts of a mean duration [s]."""
+        stop = min(1.0, 1.0 / max(length * self.fps, 1.0))
+        begin = min(1.0, stop * share / max(1.0 - share, 1e-9))
+        luck = self.rng.random(shape)
+        on = np.empty(shape, np.bool_)
+        on[0] = luck[0] < share
+        for row in range(1, shape[0]):
+            on[row] = np.where(on[row - 1], luck[row] >= stop, luck[row] < begin)
+        return on

@@ -17,12 +17,7 @@ from data_contracts.static_calibration import ClickedMarkings
 from worldpose.formats.joints_file import JointTracks
 from worldpose.ingest.writing import MatchAnnotations, write_match
 from worldpose.pitch.template import PitchTemplate
-from worldpose.simulation.foreign.detectors import (
-    PROFILES,
-    defined_joints,
-    detect_people,
-    draw_detector,
-)
+from worldpose.simulation.foreign.detectors import PROFILES, Detector, Filming
 from worldpose.simulation.foreign.gait import walk_posture
 from worldpose.simulation.foreign.recordings import Recordings, play_motion, read_recordings
 from worldpose.simulation.foreign.rigs import (
@@ -54,6 +49,7 @@ from worldpose.simulation.foreign.trajectories import (
 )
 from worldpose.simulation.recorded_files import follow_track
 from worldpose.simulation.reference import CLIP_ID, Report, write_reference
+from worldpose.simulation.settings import MatchOptions
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,20 +63,20 @@ class Person:
 
 @dataclass(frozen=True, eq=False)
 class ForeignScene:
-    """A match of the second simulator in memory.
+    """A match of the second simulator in memory; what is by camera has its id.
 
     Attributes:
         fps: frame rate [1/s].
         truth: anatomical joints; `views` counts the cameras that see the joint.
         defined: joints as the detector defines them.
         people: bones, motion and joints of each person.
-        cameras: true cameras, by id.
-        given: cameras of calibration.toml, by id; empty if they are to be clicked.
-        clicked: clicks, by id of a camera without calibration.
+        cameras: true cameras.
+        given: cameras of calibration.toml; empty if they are to be clicked.
+        clicked: clicks of cameras without calibration.
         misnamed: name of the point under a wrongly named click, by camera and wrong name.
-        reports: detections, by camera.
+        reports: detections.
         offsets: offsets of the cameras' frame numbers, as stated [frame].
-        clock_offsets: clock offset of a camera's exposure, by id [frame].
+        clock_offsets: clock offset of a camera's exposure [frame].
         pitch: None in a hall.
         record: all other drawn values, for world.json.
     """
@@ -103,23 +99,19 @@ class ForeignScene:
 def simulate_foreign_scene(
     scenario: ForeignScenario,
     seed: int,
-    *,
-    duration: float | None = None,
-    cameras: int | None = None,
-    people: int | None = None,
+    options: MatchOptions = MatchOptions(),  # noqa: B008
     recordings: Recordings | None = None,
-    calibrated: bool = False,
 ) -> ForeignScene:
     """Return a match of the second simulator; the same arguments give the same numbers.
 
-    `duration` [s], `cameras` and `people` take the place of the scenario's; `calibrated` returns
-    the exact cameras. Without recordings, all motion is computed.
+    Of the options, duration, cameras, players and calibrated hold. Without recordings, all motion
+    is computed.
     """
     streams = np.random.SeedSequence([seed, *scenario.name.encode()]).spawn(6)
     rng = np.random.default_rng(streams[0])
     on_pitch = bool(rng.random() < scenario.pitch)
     pitch = draw_pitch(rng) if on_pitch else None
-    given = bool(rng.random() < scenario.given) or not on_pitch or calibrated
+    given = bool(rng.random() < scenario.given) or not on_pitch or options.calibrated
     fps = float(rng.choice(scenario.rates))
     count = int(rng.integers(scenario.people[0], scenario.people[1] + 1))
     mounted = int(rng.integers(scenario.cameras[0], scenario.cameras[1] + 1))
@@ -128,9 +120,9 @@ def simulate_foreign_scene(
     layout: Layout = drawn if on_pitch else "hall"
     side = rng.uniform(*scenario.hall, 2)
     part = rng.uniform(*scenario.area, 2)
-    count, mounted = people or count, cameras or mounted
+    count, mounted = options.players or count, options.cameras or mounted
 
-    frames = round((duration or scenario.duration) * fps)
+    frames = round((options.duration or scenario.duration) * fps)
     times, on_frames = _motion_times(frames, fps)
     center, size, painted = np.zeros(2), side, None
     ground: Ground = _flat_ground
@@ -153,7 +145,7 @@ def simulate_foreign_scene(
     named = _mount_cameras(mounted, layout, space, joints, clickable, rng)
 
     rng = np.random.default_rng(streams[3])
-    detector = draw_detector(PROFILES[list(PROFILES)[rng.integers(len(PROFILES))]], rng)
+    detector = Detector.draw(PROFILES[list(PROFILES)[rng.integers(len(PROFILES))]], rng)
     personal = rng.standard_normal((count, 17, 3))
     statures = np.array([person.skeleton.stature for person in persons])
     motion = make_interp_spline(times, np.stack([p.joints for p in persons], axis=1), k=3)
@@ -172,13 +164,17 @@ def simulate_foreign_scene(
         if clock_offsets[name]:
             then = np.asarray(motion(times[on_frames] + clock_offsets[name] / fps))
         view = view_people(camera, then, statures, pillars[name])
-        taken = camera.project(defined_joints(then, detector, personal))
-        image_size = camera.camera.image_size
-        reports[name] = detect_people(detector, view, taken, image_size, fps, lost, rng)
+        taken = camera.project(detector.define(then, personal))
+        filming = Filming(detector, view, camera.camera.image_size, fps, rng)
+        reports[name] = filming.detect(taken, lost)
         views += view.seen
 
     rng = np.random.default_rng(streams[5])
-    accuracy = 0.0 if calibrated else float(rng.uniform(0.3, 2.0)) * (0.2 if pitch is None else 1.0)
+    accuracy = (
+        0.0
+        if options.calibrated
+        else float(rng.uniform(0.3, 2.0)) * (0.2 if pitch is None else 1.0)
+    )
     calibrations, clicked, misnamed = {}, {}, {}
     for name, camera in named.items():
         if given:
@@ -189,7 +185,7 @@ def simulate_foreign_scene(
     return ForeignScene(
         fps=fps,
         truth=JointTracks(np.arange(frames), np.arange(count), joints, views=views),
-        defined=defined_joints(joints, detector, personal),
+        defined=detector.define(joints, personal),
         people=persons,
         cameras=named,
         given=calibrations,
@@ -222,9 +218,7 @@ def simulate_foreign_scene(
 
 def _motion_times(frames: int, fps: float) -> tuple[Floats, Integers]:
     """Return the times of the motion [s], and which of them are frames."""
-    # Minimum rate of the motion's computation [1/s], a multiple of the frame rate.
-    motion_rate = 100.0
-    multiple = int(np.ceil(motion_rate / fps))
+    multiple = int(np.ceil(100.0 / fps))  # the motion is computed 100 times a second or more
     step = 1.0 / (fps * multiple)
     lead = round(LEAD / step)
     ticks = np.arange((frames - 1) * multiple + 1 + 2 * lead) - lead
@@ -262,10 +256,9 @@ def _draw_people(
     replayed = {}
     if pitch is not None and recordings is not None:
         known = _follow_tracking(recordings, count, times, pitch, rng)
-    # Share of people who replay motion capture if there is any [1].
-    replayed_share = 0.3
     if recordings is not None and recordings.motions:
-        for person in np.flatnonzero(rng.random(count) < replayed_share).tolist():
+        # Share of people who replay motion capture [1].
+        for person in np.flatnonzero(rng.random(count) < 0.3).tolist():
             one = recordings.motions[rng.integers(len(recordings.motions))]
             place = area[0] + area[1] * rng.uniform(-0.4, 0.4, 2)
             if person in known:
@@ -293,8 +286,7 @@ def _follow_tracking(
     recordings: Recordings, count: int, times: Floats, pitch: Pitch, rng: np.random.Generator
 ) -> dict[int, Trajectory]:
     """Return the trajectories of tracked people, in most matches if the data are long enough."""
-    # Share of matches on a pitch whose people follow tracking data if there is any [1].
-    tracked = 0.75
+    tracked = 0.75  # share of matches on a pitch whose people follow tracking data [1]
     long = [track for track in recordings.tracks if track.clock[-1] >= times[-1] - LEAD]
     if not long or rng.random() >= tracked:
         return {}
@@ -321,9 +313,7 @@ def _mount_cameras(
     rng: np.random.Generator,
 ) -> dict[str, RigCamera]:
     """Return cameras by id; if they are to be clicked, others for those that see few markings."""
-    # Minimum number of named points in the image of a camera to be calibrated from clicks
-    # [1].
-    enough_points = 6
+    enough_points = 6  # fewest named points in the image of a camera that is clicked [1]
     # Heads, hips and feet at intervals.
     action = joints[:: max(1, len(joints) // 15)][:, :, [0, 11, 15]].reshape(-1, 3)
     mounted = draw_rig(count, layout, space, action, rng)
@@ -344,35 +334,20 @@ def simulate_foreign_match(
     scenario: ForeignScenario,
     seed: int,
     out: Path,
-    *,
-    duration: float | None = None,
-    cameras: int | None = None,
-    people: int | None = None,
+    options: MatchOptions = MatchOptions(),  # noqa: B008
     recordings: Path | None = None,
-    calibrated: bool = False,
 ) -> MatchSpec:
-    """Write a match folder of the second simulator; the same arguments give the same bytes.
+    """Write a match folder of the second simulator, and return its match.yaml.
 
-    docs/explanation/simulation.md describes the files.
-
-    `out` is absent or an empty folder; the write is atomic. `recordings` is as for
-    `read_recordings`, other options as for `simulate_foreign_scene`.
-
-    Returns:
-        The match's match.yaml.
+    The same arguments give the same bytes. docs/explanation/simulation.md describes the files.
+    `out` is absent or an empty folder; the write is atomic. See `simulate_foreign_scene` and
+    `read_recordings`.
 
     Raises:
         InputError: `out` holds files, or the recordings cannot be used.
     """
-    scene = simulate_foreign_scene(
-        scenario,
-        seed,
-        duration=duration,
-        cameras=cameras,
-        people=people,
-        recordings=None if recordings is None else read_recordings(recordings),
-        calibrated=calibrated,
-    )
+    replayed = None if recordings is None else read_recordings(recordings)
+    scene = simulate_foreign_scene(scenario, seed, options, replayed)
     # Cameras number frames on their own.
     reports = {}
     for name, report in scene.reports.items():
@@ -381,17 +356,9 @@ def simulate_foreign_match(
     records = {"clocks": scene.clock_offsets, "world": scene.record}
     if scene.pitch is not None:
         records["clicks"] = {name: {"wrong": each} for name, each in scene.misnamed.items()}
-    changes = {
-        f"{duration:g}s" if duration else "": duration,
-        f"{cameras}cameras": cameras,
-        f"{people}players": people,
-        "recordings": recordings,
-        "calibrated": calibrated,
-    }
-    parts = [scenario.name, str(seed), *(text for text, made in changes.items() if made)]
     sizes = {name: each.camera.image_size.tolist() for name, each in scene.cameras.items()}
     spec = MatchSpec(
-        match_id="-".join(parts),
+        match_id=options.name(scenario.name, seed, *["recordings"] * (recordings is not None)),
         fps=scene.fps,
         cameras=tuple(
             CameraSpec(id=name, width=width, height=height, offset_frames=scene.offsets[name])
