@@ -6,7 +6,7 @@ Inputs: the files that a method's own code wrote, and the body model for its pos
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,17 +14,8 @@ from typing import Final
 
 from worldpose.body.model import BodyModel
 from worldpose.errors import UsageError
-from worldpose.formats.baselines.camera_methods import read_humans4d, read_hybrik
-from worldpose.formats.baselines.result import MethodResult
-from worldpose.formats.baselines.world_methods import (
-    read_glamr,
-    read_gvhmr,
-    read_prompthmr,
-    read_slahmr,
-    read_smpl,
-    read_tram,
-    read_wham,
-)
+from worldpose.formats.baselines import methods
+from worldpose.formats.baselines.result import MethodResult, Person, Poser, World, merge_people
 
 
 @dataclass(frozen=True)
@@ -35,39 +26,46 @@ class Method:
     """Name on the command line."""
     title: str
     """Name in tables."""
-    read: Callable[[Path, BodyModel, tuple[int, int]], MethodResult]
-    """Takes path, body and the video's width and height [px]."""
+    world: World
+    people: Callable[[Path, Poser, tuple[int, int]], Iterator[Person]]
+
+    def read(self, path: Path, model: BodyModel, image_size: tuple[int, int]) -> MethodResult:
+        """Return the people of a result, posed with a body, in a video of a size [px].
+
+        Raises:
+            InputError: the file or folder has another layout, or nobody in it.
+        """
+        poser = Poser(model)
+        people = list(self.people(path, poser, image_size))
+        return merge_people(self.world, people, poser.notes, poser.image_size)
 
 
 METHODS: Final = {
     method.name: method
     for method in (
-        Method("hybrik", "HybrIK", read_hybrik),
-        Method("4dhumans", "4DHumans", read_humans4d),
-        Method("glamr", "GLAMR", read_glamr),
-        Method("slahmr", "SLAHMR", partial(read_slahmr, phase="motion_chunks")),
-        Method(
-            "slahmr-true-cameras",
-            "SLAHMR w/ GT cameras",
-            partial(read_slahmr, phase="motion_chunks"),
+        Method("hybrik", "HybrIK", "camera", methods.read_hybrik),
+        Method("4dhumans", "4DHumans", "camera", methods.read_humans4d),
+        Method("glamr", "GLAMR", "shared", methods.read_glamr),
+        *(
+            Method(f"slahmr{name}", title, "shared", partial(methods.read_slahmr, phase=phase))
+            for name, title, phase in (
+                ("", "SLAHMR", "motion_chunks"),
+                ("-true-cameras", "SLAHMR w/ GT cameras", "motion_chunks"),
+                ("-no-humor", "SLAHMR w/o HuMoR", "smooth_fit"),
+            )
         ),
-        Method("slahmr-no-humor", "SLAHMR w/o HuMoR", partial(read_slahmr, phase="smooth_fit")),
-        Method("wham", "WHAM", read_wham),
-        Method("gvhmr", "GVHMR", read_gvhmr),
-        Method("tram", "TRAM", read_tram),
-        Method("prompthmr", "PromptHMR", read_prompthmr),
-        Method("smpl", "SMPL file", read_smpl),
+        Method("wham", "WHAM", "own", methods.read_wham),
+        Method("gvhmr", "GVHMR", "own", methods.read_gvhmr),
+        Method("tram", "TRAM", "shared", methods.read_tram),
+        Method("prompthmr", "PromptHMR", "shared", methods.read_prompthmr),
+        Method("smpl", "SMPL file", "shared", methods.read_smpl),
     )
 }
 """By name, in the order of the paper's table."""
 
 
 def find_method(name: str) -> Method:
-    """Return a method by its name.
-
-    Raises:
-        UsageError: no method has this name.
-    """
+    """Return a method by its name; UsageError if none has it."""
     if name not in METHODS:
         todo = "Name the method as NAME=PATH."
         raise UsageError(f"--method {name}", f"one of {', '.join(METHODS)}", repr(name), todo)

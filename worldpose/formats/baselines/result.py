@@ -130,43 +130,62 @@ class MethodTrack:
     scale: Floats | None = None
     """(frames,) scale factor of the body about its pelvis; None = 1."""
 
+    @classmethod
+    def of_matrices(
+        cls, frames: NDArray[np.int64], matrices: Floats, place: Floats, betas: Floats
+    ) -> MethodTrack:
+        """Return the track of rotation matrices (frames, 24, 3, 3) relative to the parents."""
+        vectors = Rigid(np.asarray(matrices, np.float64), np.zeros(matrices.shape[:-1])).rotvec
+        return cls(frames, vectors[:, 0], vectors[:, 1:].reshape(-1, 69), place, betas)
 
-def pose_track(
-    track: MethodTrack, model: BodyModel, shape: Shape, place: Place = "transl"
-) -> tuple[Floats, str]:
-    """Return the joints (frames, 17, 3) [m] of one person, and the source of its shape.
 
-    The betas are used if `model` is the body of `shape`.
+@dataclass
+class Poser:
+    """Poses the bodies of a result with a body model.
+
+    Attributes:
+        model: the body model.
+        notes: notes of the result, among them the source of the shape.
+        image_size: that of the result [px].
     """
-    body_angles = 69
-    count = len(track.frames)
-    pose = np.zeros((count, body_angles))
-    pose[:, : track.body_pose.shape[-1]] = track.body_pose
-    betas = np.zeros((count, model.shapes))
-    used = shape == ("open" if is_open_body(model.name) else "smpl") and track.betas is not None
-    if used and track.betas is not None:
-        known = min(model.shapes, track.betas.shape[-1])
-        betas[:, :known] = track.betas[..., :known]
-    shift = track.place if place == "transl" else np.zeros((count, 3))
-    names = (*COCO17, "mid_hip")
-    keypoints = fold_keypoints(model, names)
-    points = np.empty((count, len(names), 3))
-    # Bodies posed per chunk: 50 MB.
-    chunk_bodies = 4096
-    for start in range(0, count, chunk_bodies):
-        part = slice(start, start + chunk_bodies)
-        points[part] = keypoints(
-            BodyParameters(betas[part], track.global_orient[part], pose[part], shift[part])
-        )
-    joints, pelvis = points[:, :-1], points[:, -1:]
-    if track.scale is not None:
-        joints = pelvis + track.scale[:, None, None] * (joints - pelvis)
-    if place == "pelvis":
-        joints = joints - pelvis + track.place[:, None]
-    elif place == "mid_hip":
-        hips = joints[:, COCO17.index("left_hip")] + joints[:, COCO17.index("right_hip")]
-        joints = joints - 0.5 * hips[:, None] + track.place[:, None]
-    return joints, "the file's betas" if used else f"the mean shape of {model.name}"
+
+    model: BodyModel
+    notes: dict[str, str] = field(default_factory=dict)
+    image_size: tuple[float, float] | None = None
+
+    def joints(self, track: MethodTrack, shape: Shape, place: Place = "transl") -> Floats:
+        """Return the joints (frames, 17, 3) [m] of one person.
+
+        The betas are used if the model is the body of `shape`.
+        """
+        model, count = self.model, len(track.frames)
+        pose = np.zeros((count, 69))
+        pose[:, : track.body_pose.shape[-1]] = track.body_pose
+        betas = np.zeros((count, model.shapes))
+        self.notes["shape"] = f"the mean shape of {model.name}"
+        if track.betas is not None and shape == ("open" if is_open_body(model.name) else "smpl"):
+            known = min(model.shapes, track.betas.shape[-1])
+            betas[:, :known] = track.betas[..., :known]
+            self.notes["shape"] = "the file's betas"
+        shift = track.place if place == "transl" else np.zeros((count, 3))
+        names = (*COCO17, "mid_hip")
+        keypoints = fold_keypoints(model, names)
+        points = np.empty((count, len(names), 3))
+        chunk_bodies = 4096  # bodies posed per chunk: 50 MB
+        for start in range(0, count, chunk_bodies):
+            part = slice(start, start + chunk_bodies)
+            points[part] = keypoints(
+                BodyParameters(betas[part], track.global_orient[part], pose[part], shift[part])
+            )
+        joints, pelvis = points[:, :-1], points[:, -1:]
+        if track.scale is not None:
+            joints = pelvis + track.scale[:, None, None] * (joints - pelvis)
+        if place == "pelvis":
+            joints = joints - pelvis + track.place[:, None]
+        elif place == "mid_hip":
+            hips = joints[:, COCO17.index("left_hip")] + joints[:, COCO17.index("right_hip")]
+            joints = joints - 0.5 * hips[:, None] + track.place[:, None]
+        return joints
 
 
 class Person(NamedTuple):
@@ -230,12 +249,6 @@ def boxes_around(pixels: Floats) -> Floats:
     return np.where(np.isfinite(found), found, np.nan)
 
 
-def rotation_vectors(matrices: Any) -> Floats:  # noqa: ANN401
-    """Convert a file's rotation matrices (..., 3, 3) to rotation vectors (..., 3) [rad]."""
-    array = np.asarray(matrices, dtype=np.float64)
-    return Rigid(array, np.zeros(array.shape[:-1])).rotvec
-
-
 def resample_result(result: MethodResult, seen_fps: float, fps: float) -> MethodResult:
     """Return a result at its clip's `fps`, with linear interpolation of joints and boxes.
 
@@ -293,20 +306,16 @@ def read_pickled(path: Path) -> Part:
         InputError: the file is not readable, or names classes that no result needs.
     """
     try:
-        found = read_pickle(path)
-        if not isinstance(found, dict | list | np.ndarray):
-            raise ValueError(f"a {type(found).__name__}")
-        return Part(str(path), found)
-    except OSError as error:
-        raise _reading_error(path, f"a file that cannot be read ({error})") from None
-    except ValueError as error:
-        raise _reading_error(path, f"a file that cannot be read as such ({error})") from error
-
-
-def _reading_error(path: Path, found: str) -> InputError:
-    expected = "results of a method: arrays in a pickle, joblib, numpy or torch file"
-    todo = "Give the file that the method's own code wrote. Nothing in this file was run."
-    return InputError(str(path), expected, found, todo)
+        content = read_pickle(path)
+        if not isinstance(content, dict | list | np.ndarray):
+            raise ValueError(f"a {type(content).__name__}")
+        return Part(str(path), content)
+    except (OSError, ValueError) as error:
+        such = " as such" if isinstance(error, ValueError) else ""
+        expected = "results of a method: arrays in a pickle, joblib, numpy or torch file"
+        found = f"a file that cannot be read{such} ({error})"
+        todo = "Give the file that the method's own code wrote. Nothing in this file was run."
+        raise InputError(str(path), expected, found, todo) from error
 
 
 @dataclass(frozen=True)
@@ -347,15 +356,9 @@ class Part:
         array = self.as_floats()
         while array.ndim > len(shape) and 1 in array.shape:
             # The first extra dimension that the shape lacks.
-            lone = next(
-                (
-                    i
-                    for i, n in enumerate(array.shape)
-                    if n == 1 and _fits(np.delete(array.shape, i), shape)
-                ),
-                array.shape.index(1),
-            )
-            array = array.squeeze(lone)
+            ones = [i for i, n in enumerate(array.shape) if n == 1]
+            fitting = (i for i in ones if _fits(np.delete(array.shape, i), shape))
+            array = array.squeeze(next(fitting, ones[0]))
         if not _fits(array.shape, shape):
             wanted = ", ".join("any" if n is None else str(n) for n in shape)
             raise format_error(self.where, f"numbers of shape ({wanted})", f"{array.shape}")
@@ -384,7 +387,7 @@ class Part:
 
 
 def _fits(found: object, shape: tuple[int | None, ...]) -> bool:
-    lengths = tuple(np.asarray(found).tolist())
+    lengths = np.asarray(found).tolist()
     return len(lengths) == len(shape) and all(
-        wanted in (None, n) for n, wanted in zip(lengths, shape, strict=True)
+        map(lambda n, want: want in (None, n), lengths, shape)
     )
