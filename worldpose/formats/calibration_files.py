@@ -75,8 +75,7 @@ def build_camera(
             rotation, or the name is unfit for a file.
     """
     distance_limit = 1e7  # maximum coordinate of a translation [m]
-    # Maximum width and height of an image [px]; OpenCV's own limit for most operations.
-    size_limit = 1 << 16
+    size_limit = 1 << 16  # of an image [px]; OpenCV's own for most operations
     size, focal, principal_point, distortion, lens_model = optics
     if np.any(size < 1) or np.any(size > size_limit) or np.any(size != np.round(size)):
         expected = f"whole pixels from 1 to {size_limit}; an import with --videos takes theirs"

@@ -233,9 +233,7 @@ def _read_opencap(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
     they point down tells which. The world is the board's, turned so that z is up; of a standing
     board as in Pose2Sim's conversion: x' = -x, y' = -z, z' = -y.
     """
-    # Minimum mean cosine between the cameras' downward axes and the vertical [1]: phones that
-    # are tilted by 40 degrees.
-    upright = 0.75
+    upright = 0.75  # mean cosine of images' down and the vertical: 40 degrees [1]
     tables = {file: _read_pickle(file) for file in files}
     down = np.mean([_downward(file, table) for file, table in tables.items()], axis=0)
     # (3, 3) from a board whose y points down to a world with z up.

@@ -21,10 +21,8 @@ def require_metres(
     path: Path, cameras: Mapping[str, CameraCalibration], unit_m: float = 1.0
 ) -> None:
     """Raise InputError if the distances of cameras [m] contradict the unit of their file [m]."""
-    # Minimum distance of the farthest camera from the middle in a file in millimetres [m].
-    nearest_m = 0.1
-    # Maximum distance of a camera from the middle of all [m]: around a stadium it is 200 m.
-    farthest_m = 1000.0
+    nearest_m = 0.1  # farthest camera from the middle in a file in mm, at least
+    farthest_m = 1000.0  # of a camera from the middle of all: 200 m around a stadium
     centers = np.array([-np.array(each.rotation).T @ each.translation for each in cameras.values()])
     distance = float(np.linalg.norm(centers - centers.mean(axis=0), axis=-1).max())
     in_millimetres = unit_m == MILLIMETRE
@@ -123,12 +121,9 @@ def square_focal(focal: Sequence[float], where: str) -> tuple[float, float]:
     """
     fx, fy = focal
     if abs(fx - fy) > 0.02 * fx:
-        raise InputError(
-            f"{where}.matrix",
-            expected="fx and fy of square pixels, within 2 %",
-            found=f"{fx:g} and {fy:g}",
-            todo="Correct the calibration file.",
-        )
+        expected = "fx and fy of square pixels, within 2 %"
+        todo = "Correct the calibration file."
+        raise InputError(f"{where}.matrix", expected, f"{fx:g} and {fy:g}", todo)
     return 0.5 * (fx + fy), 0.5 * abs(fx - fy)
 
 
@@ -142,8 +137,7 @@ def require_optics(
 
     A principal point in the middle of an image of the exchanged size shows that it is exchanged.
     """
-    # Maximum distance of the principal point from the image center, in longer sides [1].
-    center_sizes = 10
+    center_sizes = 10  # of the principal point from the center, in longer sides [1]
     # Minimum and maximum focal length over the image's longer side [1]: a field of view of
     # 168 degrees, and a telescope's of 0.06.
     focal_ratios = (0.05, 1000.0)

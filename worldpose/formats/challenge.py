@@ -61,8 +61,7 @@ def challenge_truth(model: BodyModel, poses: BodyParameters, camera: Camera) -> 
     points = fold_keypoints(model, BODY25)
     joints = np.empty((frames, persons, len(BODY25), 3))
     boxes = np.empty((frames, persons, 4))
-    # Frames whose surfaces are in memory at a time; 33 MB for 25 people.
-    block_frames = 8
+    block_frames = 8  # whose surfaces are in memory at a time; 33 MB for 25 people
     for start in range(0, frames, block_frames):
         part = slice(start, min(start + block_frames, frames))
         some = poses[:, part]
@@ -321,8 +320,7 @@ def _read_table(path: Path, only: Collection[str] | None) -> dict[str, Floats]:
             raise wrong(f"{path}: {', '.join(names)}", "numbers", say_failure(error)) from error
 
     index = numbers(_COLUMNS[1:4])
-    # Largest number of persons in a submission's table [1].
-    max_persons = 1000
+    max_persons = 1000  # in a submission's table [1]
     limits = np.array([FRAME_LIMIT, max_persons, len(CHALLENGE15)])
     off = (index != np.floor(index)) | (index < 0) | (index >= limits)
     if off.any():

@@ -60,9 +60,7 @@ def read_coco_results(path: Path) -> PeopleFile:
             scale, no frame number, or too many people per frame; the error names file, result and
             point.
     """
-    # Maximum size of a JSON file [byte], about two million people; npz holds more and is
-    # faster.
-    json_bytes = 1 << 30
+    json_bytes = 1 << 30  # two million people; npz holds more and is faster
     keep = ("images", "meta_info")
     items = JsonItems(path, "annotations", json_bytes, keep, other_key="instance_info")
     categories = _categories(path, json_bytes)

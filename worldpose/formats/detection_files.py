@@ -269,8 +269,7 @@ def _read_identified(file: Path, frames: int) -> GivenBoxes:
 
 def _read_rows(file: Path) -> tuple[list[tuple[int, str]], NDArray[np.float64]]:
     """Return the number and text of each line that is not empty, and its numbers."""
-    # Maximum size of a file of boxes [byte]: that of 22 people in an hour has 200 MB.
-    box_bytes = 1 << 28
+    box_bytes = 1 << 28  # that of 22 people in an hour has 200 MB
 
     def wrong(where: str, expected: str, found: str) -> InputError:
         todo = "Write lines of MOTChallenge: frame,id,left,top,width,height,confidence."
@@ -282,8 +281,7 @@ def _read_rows(file: Path) -> tuple[list[tuple[int, str]], NDArray[np.float64]]:
     sign = "." if has_commas else ","
     lines = [(n, ",".join(cell.replace(",", sign) for cell in row)) for n, row in cells]
     count = lines[0][1].count(",") + 1
-    # Numbers in a line of boxes: those of a result are 10, of MOTChallenge's truth 9.
-    box_columns = range(6, 11)
+    box_columns = range(6, 11)  # 10 of a result, 9 of MOTChallenge's truth
     for number, each in lines:
         if each.count(",") + 1 != count or count not in box_columns:
             raise wrong(

@@ -373,8 +373,7 @@ class _Writer:
 
     def add_pitch(self, markings: Sequence[Floats]) -> int:
         """Add the markings as flat strips, above a lawn; return the node."""
-        # Depth of the lawn below the lowest marking, so that it does not cover it [m].
-        lawn_depth_m = 0.02
+        lawn_depth_m = 0.02  # below the lowest marking, which it does not cover
         lawn_margin_m = 4.0  # width of the lawn around the markings [m]
         lawn, white = (
             self._add_material(color, 1.0) for color in ((0.12, 0.35, 0.14), (1.0, 1.0, 1.0))
@@ -412,9 +411,7 @@ def paint_strips(markings: Sequence[Floats]) -> tuple[Floats, Integers]:
 
     Lines (points, 3) [m], world, have two points or more.
     """
-    # Width of painted lines, at most, by the Laws [m]: programs do not render lines without
-    # width.
-    marking_width_m = 0.12
+    marking_width_m = 0.12  # at most by the Laws; programs render no line without width
     vertices, triangles, first = [], [], 0
     for line in markings:
         way = np.gradient(line[:, :2], axis=0)

@@ -79,8 +79,7 @@ def read_keypoint_arrays(path: Path) -> KeypointDetections:
     """
     points_limit = 1000  # maximum number of these points
     require_file(path)
-    # Members of points besides COCO-17: all or none.
-    extra_members = ("point", "extra_keypoints", "extra_confidence")
+    extra_members = ("point", "extra_keypoints", "extra_confidence")  # all or none
     with open_npz(path) as file:
         infos, sizes = check_members(path, file, _MEMBERS)
         extra = [name for name in extra_members if name in infos]
@@ -112,8 +111,7 @@ def _check_values(path: Path, people: KeypointDetections) -> None:
         raise wrong(f"{path}: frame[{place}]", "frame numbers that rise", f"{people.frame[place]}")
     if np.any(np.abs(people.frame) > FRAME_LIMIT):
         raise wrong(f"{path}: frame", f"frame numbers up to {FRAME_LIMIT}", "larger ones")
-    # Frames per block of checks, which limits their memory.
-    block_frames = 4096
+    block_frames = 4096  # frames per block of checks, which limits their memory
     block = max(1, min(block_frames, block_people // max(1, people.score.shape[1])))
     for start in range(0, len(people.frame), block):
         _check_block(path, start, people[start : start + block])

@@ -175,8 +175,7 @@ def order_by_names(where: str, names: Sequence[str]) -> PointOrder:
     plain = [_plain(str(name)) for name in names]
     if "left_ankle" not in plain:  # Human3.6M calls them feet
         plain = [re.sub(r"^(left|right)_foot$", r"\1_ankle", name) for name in plain]
-    # Number of COCO-17's joints that belong to the face, the first ones.
-    face_joints = 5
+    face_joints = 5  # of COCO-17, the first ones
     missing = [joint for joint in COCO17[face_joints:] if joint not in plain]
     if missing or any(plain.count(joint) > 1 for joint in (*COCO17, *FEET)):
         unknown = [str(n) for n, one in zip(names, plain, strict=True) if one not in COCO17]

@@ -192,8 +192,7 @@ def _read_file(file: Path) -> dict[str, Any]:
             return {"K" if array.shape == (3, 3) else "dist": array}
     except (OSError, ValueError, EOFError) as error:
         raise calibration_error(str(file), "arrays of numbers", say_failure(error)) from error
-    # Largest size of an npz file's arrays [byte]: calibrations may keep the corners of all boards.
-    max_bytes = 1 << 26
+    max_bytes = 1 << 26  # of arrays [byte]: calibrations may keep the corners of all boards
     if suffix == ".npz":
         return dict(read_npz(file, max_bytes))
     if suffix in (".yml", ".yaml", ".json", ".toml"):

@@ -227,9 +227,7 @@ def write_motion(path: Path, model: BodyModel, poses: BodyParameters, fps: float
     Raises:
         InputError: there are no frames, or a parameter is missing.
     """
-    # Centimetres in a metre: animation tools interpret the numbers of a BVH file as
-    # centimetres.
-    centimetres = 100.0
+    centimetres = 100.0  # in a metre: animation tools take numbers of BVH for them
     angles = np.concatenate([poses.global_orient, poses.body_pose], axis=-1)
     if not len(angles) or not np.isfinite([angles.sum(), poses.transl.sum()]).all():
         found = f"{len(angles)} frames, some without" if len(angles) else "no frames"
@@ -346,8 +344,7 @@ def opensim_coordinates(model: BodyModel, poses: BodyParameters) -> Floats:
         return whole
 
     hips = model.joints(poses)[:, [_JOINT["left_hip"], _JOINT["right_hip"]]].mean(axis=1)
-    # Middle of the hips from the pelvis's origin in the unscaled model [m], pelvis axes.
-    mid_hip_m = np.array([-0.056276, -0.07849, 0.0])
+    mid_hip_m = np.array([-0.056276, -0.07849, 0.0])  # from the unscaled pelvis's origin
     place = hips @ Y_UP.T - pelvis @ mid_hip_m
     columns = {}
     # Rotation of the right arm from hanging, OpenSim's zero, to the T-pose: -90 degrees about x.

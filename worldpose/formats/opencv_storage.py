@@ -107,8 +107,7 @@ def _is_plain(value: object) -> bool:
 def _read_matrix(where: str, table: dict[str, Any]) -> NDArray[np.float64]:
     """Return a matrix (rows, columns), or (rows, columns, channels), or one of more dimensions."""
     types = {"u": "<u1", "c": "<i1", "w": "<u2", "s": "<i2", "i": "<i4", "f": "<f4", "d": "<f8"}
-    # Length of the text before base64 data, which repeats the type [byte].
-    header_bytes = 24
+    header_bytes = 24  # before base64 data, which repeats the type [byte]
     try:
         kind = re.fullmatch(r"(\d{0,3})([ucwsifd])", str(table.get("dt", "d")))  # ROS has none
         if kind is None:

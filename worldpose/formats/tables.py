@@ -233,9 +233,7 @@ def _strides(
 ) -> list[tuple[int, int]]:
     """Return rows of the first and last frame of the strides of one foot."""
     min_swing_m = 0.15  # least travel of the ankle relative to the hips in a stride [m]
-    # Shortest time between two contacts of one foot [s]: sprinters take 2.3 strides per
-    # second.
-    min_stride_s = 0.4
+    min_stride_s = 0.4  # shortest time between contacts of a foot: sprinters take 2.3 a second
     from scipy.signal import find_peaks  # late: it takes a second, and reports need no strides
 
     half = max(1, round(0.5 * SPEED_WINDOW_S * fps))
@@ -260,8 +258,7 @@ def _strides(
 
 
 def _is_stride(duration: float, way: Floats) -> bool:
-    # Lowest mean speed of a stride [m/s]: slower people stand, turn or shuffle.
-    min_stride_speed_m_s = 0.5
+    min_stride_speed_m_s = 0.5  # slower people stand, turn or shuffle
     max_stride_s = 2.0  # longest stride [s]: in a longer one the person stood
     speed = float(np.linalg.norm(way)) / duration
     return duration <= max_stride_s and speed >= min_stride_speed_m_s

@@ -176,9 +176,7 @@ class _Writer:
 
     def add_camera(self, name: str, camera: Camera) -> None:
         """Add a single or a moving camera."""
-        # Width of a camera's sensor [tenth of a unit]; only its ratio to the focal length
-        # counts.
-        aperture_mm = 36.0
+        aperture_mm = 36.0  # of a sensor's width; only its ratio to the focal length counts
         place, again = f"/world/{_prim_name(name)}", 1
         while self.stage.GetPrimAtPath(place + f"_{again}" * (again > 1)).IsValid():
             again += 1

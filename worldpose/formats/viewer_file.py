@@ -397,13 +397,11 @@ def _rest_arrays(clip: ViewerClip) -> Arrays:
     if not is_open_body(model.name):
         return arrays  # the surface of a licensed body stays on this machine
     surface = model.template + np.einsum("vcs,ps->pvc", model.shape_directions, betas)
-    # Joints that move one vertex.
-    influences = 4
+    influences = 4  # joints that move one vertex
     order = np.argsort(-model.weights, axis=1)[:, :influences]
     shares = np.take_along_axis(model.weights, order, axis=1)
     shares /= shares.sum(axis=1, keepdims=True)
-    # Size of the cells in which the vertices of the two reduced surfaces merge [m].
-    coarse_cell_m, rough_cell_m = 0.08, 0.16
+    coarse_cell_m, rough_cell_m = 0.08, 0.16  # in which vertices of reduced surfaces merge
     normals = vertex_normals(model.template, model.faces)
     return arrays | {
         "surface": np.round(surface / SURFACE_UNIT).astype("<i2"),
@@ -419,8 +417,7 @@ def _rest_arrays(clip: ViewerClip) -> Arrays:
 def _simplify(line: Floats) -> Floats:
     """Return a polyline (points, 3) without points that are within a centimetre of the rest."""
     kept, first = [0], 0
-    # Largest deviation of a painted line, 12 cm wide, from its points [m].
-    line_error_m = 0.01
+    line_error_m = 0.01  # largest deviation of a line, 12 cm wide, from its points
     for last in range(2, len(line)):
         along = line[last] - line[first]
         share = (line[first + 1 : last] - line[first]) @ along / max(along @ along, 1e-12)

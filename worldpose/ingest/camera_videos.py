@@ -258,8 +258,7 @@ def fit_to_video(
         InputError: the video is neither what was calibrated nor the same picture resized, or
             perhaps both the middle part of it and the same picture resized.
     """
-    # Largest relative difference of two shapes of one picture [1]: sides are whole pixels.
-    same_shape = 0.002
+    same_shape = 0.002  # largest relative difference of shapes [1]: sides are whole pixels
     if index.size == camera.image_size:
         return camera
     own, shown = np.array(camera.image_size), np.array(index.size)
@@ -303,8 +302,7 @@ def _has_black_bars(frame: Image, bar: NDArray[np.float64]) -> bool:
 
     Their width is given along x and y [px], with a fraction.
     """
-    # Largest mean brightness of a black bar [1, of 255]: the black of limited-range video.
-    max_black = 16.0
+    max_black = 16.0  # mean brightness of a bar [1, of 255]: black of limited-range video
     axis = int(bar.argmax())
     width = int(bar[axis])
     lines = frame.mean(axis=(axis, 2)).astype(np.float64)

@@ -36,12 +36,9 @@ def row_rate(where: str, fps: float, frame: Integers | None = None) -> float:
         raise InputError(f"{where}: fps", "frames per second, above 0", repr(fps), todo)
     steps = np.unique(np.diff([] if frame is None else frame))
     if len(steps) > 1 or (len(steps) and steps[0] < 1):
-        raise InputError(
-            f"{where}: frame",
-            expected="frame numbers that rise in equal steps",
-            found=f"steps from {steps[0]} to {steps[-1]}",
-            todo="Add the frames in which nobody was seen (`KeypointDetections.reindex`).",
-        )
+        expected = "frame numbers that rise in equal steps"
+        todo = "Add the frames in which nobody was seen (`KeypointDetections.reindex`)."
+        raise InputError(f"{where}: frame", expected, f"steps from {steps[0]} to {steps[-1]}", todo)
     return float(fps) / float(steps[0]) if len(steps) else float(fps)
 
 

@@ -74,10 +74,8 @@ def _read_keys(content: Mapping[str, object], keys: Sequence[str]) -> PitchSpec 
 
 def _check_size(content: Mapping[str, object], usual: PitchSpec, file: str) -> None:
     """Raise InputError for an implausible size of the pitch [m], with a guess of its unit."""
-    # Allowed sizes of a football pitch [m]: the Laws allow 90 to 120 by 45 to 90.
-    allowed = {"length": (80.0, 130.0), "width": (40.0, 100.0)}
-    # Allowed length and width of another game's pitch, relative to its template's [1].
-    allowed_shares = (0.6, 1.5)
+    allowed = {"length": (80.0, 130.0), "width": (40.0, 100.0)}  # [m], of football
+    allowed_shares = (0.6, 1.5)  # of another game, relative to its template's [1]
     for key in allowed:
         value, nominal = content.get(key), float(getattr(usual, key))
         if not _is_number(value) or value <= 0:

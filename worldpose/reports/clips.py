@@ -202,8 +202,7 @@ def visible_ground(camera: Camera) -> Floats:
     directions = camera.unproject(border).directions
     directions = directions[np.isfinite(directions[:, 0])]
     flat = np.linalg.norm(directions[:, :2], axis=-1)
-    # Length of a drawn field of view [m]: a little more than a pitch's length.
-    view_length_m = 130.0
+    view_length_m = 130.0  # of a drawn field of view: a little more than a pitch's length
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = -camera.center[2] / directions[:, 2] * flat
         # Rays that go up never meet the ground: clip them to the drawn length.

@@ -186,8 +186,7 @@ def bin_edges(values: Sequence[float]) -> Floats:
     top = max(values, default=0.0)
     if top <= 0.0:
         return np.array([0.0, 1.0])
-    # Maximum bars of a histogram, of one round width.
-    max_bars = 20
+    max_bars = 20  # of a histogram, of one round width
     power = 10.0 ** np.floor(np.log10(top / max_bars))
     width = next(power * step for step in (1.0, 2.0, 5.0, 10.0) if power * step * max_bars >= top)
     edges: Floats = np.arange(np.floor(top / width) + 2.0) * width

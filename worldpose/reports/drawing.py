@@ -140,12 +140,10 @@ def picture_panels(
     """
     dpi = 110  # resolution of a figure [px/in]
     (left, top), (across, down) = np.asarray(corner, float), np.asarray(side, float)
-    # Distance between panels [px].
-    gap = 14
+    gap = 14  # distance between panels [px]
     width = (WIDTH - gap * (len(titles) - 1)) / len(titles)
     height = round(width * down / across)
-    # Height of the titles above panels [px].
-    title_height = 32
+    title_height = 32  # above panels [px]
     whole = title_height + height + below
     figure = Figure(figsize=(WIDTH / dpi, whole / dpi), dpi=dpi, facecolor="white")
     panels = []
@@ -370,12 +368,8 @@ def require_plot(path: Path) -> None:
     # Forms of a plot.
     forms = (".svg", ".pdf", ".png")
     if path.suffix.lower() not in forms:
-        raise UsageError(
-            str(path),
-            expected=f"a file name that ends with {', '.join(forms)}",
-            found=repr(path.suffix),
-            todo="Rename it.",
-        )
+        expected = f"a file name that ends with {', '.join(forms)}"
+        raise UsageError(str(path), expected, repr(path.suffix), "Rename it.")
 
 
 def draw_synchronization(found: Synchronization, names: Sequence[str], path: Path) -> None:
@@ -406,9 +400,7 @@ def draw_synchronization(found: Synchronization, names: Sequence[str], path: Pat
 
 def draw_lens_fits(fits: Mapping[str, LensFit], path: Path) -> None:
     """Write a plot of board corners, their residuals, and residuals by radius, by camera."""
-    # Length at which the root mean square residual is drawn, as a share of the image's side
-    # [1].
-    residual_share = 0.02
+    residual_share = 0.02  # drawn length of the rms residual, of the image's side [1]
     figure = Figure(figsize=(8.0, 3.2 * len(fits)), layout="constrained")
     rows = figure.subplots(len(fits), 2, squeeze=False)
     for (seen, radial), (name, fit) in zip(rows, fits.items(), strict=True):

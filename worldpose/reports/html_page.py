@@ -235,13 +235,10 @@ SmallImage: TypeAlias = tuple[str, bytes, tuple[int, int]]
 
 def compress_image(png: bytes) -> SmallImage:
     """Return kind, content and size (width, height) [px] of a PNG: as WebP if it is smaller."""
-    # Effort to find a small WebP, of 6: the usual 4 takes twice as long, for 2 to 4 % of the
-    # size.
-    effort = 2
+    effort = 2  # of 6 for a small WebP: the usual 4 takes twice as long, for 2 to 4 % less
     quality = 88  # webP quality that keeps lines of one pixel sharp
     size = (int.from_bytes(png[16:20], "big"), int.from_bytes(png[20:24], "big"))
-    # Size of a PNG [byte] from which it counts as a photograph, not a plot.
-    photograph_bytes = 200_000
+    photograph_bytes = 200_000  # a PNG of this size is a photograph, not a plot
     if len(png) < photograph_bytes:
         return "png", png, size
     from PIL import Image  # late: pages without large images do not need it

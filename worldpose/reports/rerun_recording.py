@@ -39,12 +39,9 @@ def write_recording(
     try:
         import rerun as rr
     except ImportError:
-        raise UsageError(
-            "format rerun",
-            expected="worldpose with the extra rerun",
-            found="none installed",
-            todo="Install it: pip install 'worldpose[rerun]'.",
-        ) from None
+        expected = "worldpose with the extra rerun"
+        todo = "Install it: pip install 'worldpose[rerun]'."
+        raise UsageError("format rerun", expected, "none installed", todo) from None
     application = "worldpose"
     with whole_file(path) as draft:
         stream = rr.RecordingStream(application, recording_id=path.stem)

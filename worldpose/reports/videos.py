@@ -74,8 +74,7 @@ def _paint(
     embodied = set(bodies.person_ids[np.isfinite(poses.transl).all(axis=-1)].tolist())
     size = np.asarray(camera.image_size)
     pixels = camera.project(joints)
-    # Margin around the image within which joints count as visible, in image widths [1].
-    margin = 0.1
+    margin = 0.1  # around the image within which joints are visible, in image widths [1]
     with np.errstate(invalid="ignore"):
         near = (pixels > -margin * size[0]) & (pixels < size + margin * size[0])
     seen = embodied & set(person_ids[near.all(axis=-1).any(axis=-1)].tolist())
@@ -94,8 +93,7 @@ def _draw(canvas: Image, pixels: Floats, color: tuple[int, int, int]) -> None:
         near = (np.abs(pixels) < far * canvas.shape[1]).all(axis=-1)
     begins = np.flatnonzero(near & ~np.append(False, near[:-1]))
     ends = np.flatnonzero(near & ~np.append(near[1:], False)) + 1
-    # Subpixel steps of line coordinates per pixel.
-    steps_per_pixel = 16
+    steps_per_pixel = 16  # of line coordinates
     for begin, end in zip(begins, ends, strict=True):
         whole = np.rint(steps_per_pixel * pixels[begin:end]).astype(np.int32)
         shift = steps_per_pixel.bit_length() - 1

@@ -237,8 +237,7 @@ def _joints(cameras: Camera, rays: Rays, chosen: Floats) -> Floats:
 
 def _span(rays: Rays) -> tuple[float, float] | None:
     """Return the interval of possible joints along the ray [m]; None if empty."""
-    # Range of distances between people and cameras [m]: across the largest stadium.
-    camera_distances_m = (0.5, 300.0)
+    camera_distances_m = (0.5, 300.0)  # to people: across the largest stadium
     # Range of joint heights above the ground [m]: the ground may be lower at its edges, and
     # arms are raised in a jump.
     joint_heights_m = (-0.3, 3.2)
@@ -266,9 +265,7 @@ class PitchDrawing:
     @cached_property
     def markings(self) -> dict[str, NDArray[np.float64]]:
         """Points (n, 3) [m], world, along every marking, by name."""
-        # Spacing of points along a drawn marking [m]: the chords of a curved marking are
-        # only a few pixels long.
-        marking_spacing_m = 0.5
+        marking_spacing_m = 0.5  # chords of a curved marking are a few pixels long
         names = self.template.marking_names
         return {name: self.template.marking_points(name, marking_spacing_m) for name in names}
 

@@ -155,11 +155,9 @@ def _contents(store: Store, match_id: str, numbers: Sequence[int]) -> list[tuple
     def read(some: Sequence[int]) -> list[tuple[int, bytes]]:
         return [(number, store.blobs.read(_path(match_id, number)) or b"") for number in some]
 
-    # Entries that one reader fetches in a row.
-    batch_size = 64
+    batch_size = 64  # entries that one reader fetches in a row
     batches = [numbers[first : first + batch_size] for first in range(0, len(numbers), batch_size)]
-    # Number of parallel readers: in object storage each entry is a separate request.
-    reader_count = 8
+    reader_count = 8  # in object storage each entry is a separate request
     with ThreadPoolExecutor(reader_count) as pool:
         return [each for some in pool.map(read, batches) for each in some]
 

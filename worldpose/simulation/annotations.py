@@ -144,9 +144,7 @@ def _is_spread_out(places: Floats) -> bool:
         return False
     rest = np.array([np.delete(places[:, :2], one, axis=0) for one in range(len(places))])
     across = np.linalg.svd(rest - rest.mean(axis=1, keepdims=True), compute_uv=False)[:, 1]
-    # Points that spread less than this across their common direction [m] are collinear. If all but
-    # one are, calibration is impossible, so the user must add others.
-    min_spread_m = 2.0
+    min_spread_m = 2.0  # points across less than this are collinear [m]
     return bool(across.min() > min_spread_m)
 
 
@@ -193,8 +191,7 @@ def _draw_markings(
     pixels = camera.project(samples.points_world)
     visible = _are_visible(camera, samples.points_world, pixels, _person_boxes(camera, people))
     drawn = []
-    # Markings with a shorter visible part are not drawn [px].
-    min_length_px = 60.0
+    min_length_px = 60.0  # shorter visible parts of markings are not drawn
     for marking, name in enumerate(samples.names):
         seen = pixels[visible & (samples.marking == marking)]
         if len(seen) < 2 or np.ptp(seen, axis=0).max() < min_length_px:
@@ -226,13 +223,11 @@ def click_key_frames(
     `cameras` is a batch (frames,), `people` are joints (frames, persons, 17, 3) [m], world, of
     possible occluders. Lines and arcs are always drawn.
     """
-    # Search range for a key frame around its even place, as a share of the clip's length [1].
-    search_range = 0.1
+    search_range = 0.1  # around a key frame's even place, as a share of the clip [1]
     frames = len(people)
     drawing = settings.model_copy(update={"enough": len(pitch.points) + 1})
     picked: dict[int, Clicks] = {}
-    # Frames that a person compares for one key frame [1].
-    compared_frames = 5
+    compared_frames = 5  # that a person compares for one key frame [1]
     for middle in np.linspace(0.0, frames - 1.0, count):
         around = middle + search_range * frames * np.linspace(-1.0, 1.0, compared_frames)
         looks = {
@@ -292,8 +287,7 @@ def add_calibration_errors(
 
 
 def _move_camera(camera: Camera, turn: Floats, shift: Floats, scale: float) -> Camera:
-    # Distance of the point whose projection an error of the center leaves unchanged [m].
-    pivot = 60.0
+    pivot = 60.0  # distance of the point that an error of the center leaves in its pixel [m]
     pose = camera.cam_from_world
     # Seen from the new center, the pivot straight ahead must again be straight ahead.
     seen = np.array([0.0, 0.0, pivot]) - pose.rotation @ shift

@@ -95,9 +95,7 @@ def stride_cycle(path: GroundPath, phase: float) -> Floats:
 
     `phase` is the stride at the start of the path [1], for a person who never stands.
     """
-    # Turning by 1 rad/s needs as many steps as walking at this many metres per second [m]; a
-    # turn of less than half of that uses the hips alone.
-    turning_arm = 0.5
+    turning_arm = 0.5  # turning by 1 rad/s takes as many steps as walking at this many m/s [m]
     turning = turning_arm * np.abs(np.gradient(path.heading, path.time))
     pace = np.maximum(path.speed, np.minimum(turning, 1.0))
     rate = np.where(pace < 1.0, 0.91 * np.sqrt(pace), np.interp(pace, STRIDES[0], STRIDES[1]))

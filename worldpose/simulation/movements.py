@@ -46,8 +46,7 @@ def _steer(
     position, velocity = start.copy(), np.zeros((count, 2))
     places, headings = np.empty((len(time), count, 2)), np.empty((len(time), count))
     heading = np.zeros(count)
-    # Slower people face the ball and step aside or back [m/s].
-    facing_speed = 0.8
+    facing_speed = 0.8  # slower people face the ball and step aside or back [m/s]
     for i in range(len(time)):
         target, top, look = wish(i, position, velocity)
         change = _accelerate(position, velocity, target - position, top, space, heeds)
@@ -60,8 +59,7 @@ def _steer(
         heading = heading + (turn if i == 0 else rate * STEP)
         places[i], headings[i] = position, heading
         position = position + velocity * STEP
-    # Standard deviation of the smoothing of paths in time [s]: acceleration takes a moment.
-    smoothing = 0.06
+    smoothing = 0.06  # of paths in time, standard deviation [s]: acceleration takes a moment
     places = gaussian_filter1d(places, smoothing / STEP, axis=0, mode="nearest")
     speeds = np.linalg.norm(np.gradient(places, STEP, axis=0), axis=-1)
     return [GroundPath(time, places[:, n], headings[:, n], speeds[:, n]) for n in range(count)]
@@ -72,19 +70,13 @@ def _accelerate(
 ) -> Floats:
     """Return accelerations (people, 2) [m/s^2] by legs and by contact."""
     shoved = 20.0  # maximum in all, pushed by others [m/s^2]: a body check takes 2 m/s in 0.1 s
-    # Maximum by a person's own legs [m/s^2]; forward it falls to zero at `TOP_SPEED`.
-    acceleration = 5.0
-    # Speed wished away from a person in the same place [m/s]; more distance needs less.
-    make_way = 5.0
-    # Rate at which bodies in contact lose speed relative to each other [1/s]: they hold and
-    # lean on one another.
-    brake = 6.0
-    # Lateral acceleration on an exact collision course [m/s^2]; a pass in contact needs none.
-    dodge = 15.0
+    acceleration = 5.0  # of a person's legs at most [m/s^2]; forward none at `TOP_SPEED`
+    make_way = 5.0  # speed wished away from a person in the same place [m/s]; farther away less
+    brake = 6.0  # rate at which bodies in contact lose relative speed [1/s]: they hold and lean
+    dodge = 15.0  # sideways on an exact collision course [m/s^2]; a pass in contact needs none
     closing = 1.5  # closing speed below which people lean in instead of passing [m/s]
     foresight = 0.6  # time ahead at which people see a collision [s]
-    # Acceleration that separates two coincident bodies [m/s^2]; less overlap pushes less.
-    push = 60.0
+    push = 60.0  # apart, of two coincident bodies [m/s^2]; less overlap pushes less
     # Distance between the middles of people whose bodies begin to touch [m]: chests and
     # shoulders are 0.25 to 0.5 m thick, and arms are spread.
     touch = 0.48
@@ -131,16 +123,14 @@ def wander(
     generator each, so that an additional person changes no earlier path.
     """
     arrived = 1.5  # A wandering person that near a goal goes for the next one [m]
-    # Minimum distance between people at the start of their paths [m], where there is room.
-    start_space = 2.5
+    start_space = 2.5  # between people at the start of their paths [m], where there is room
     time, count = sample_times(duration), len(rngs)
     center, half = np.array(crowd.area_center_m), 0.5 * np.array(crowd.area_size_m)
     low, high = crowd.speed_m_s
     most = 2 * round(time[-1] - time[0])
     starts, goals = np.empty((0, 2)), np.empty((count, most, 2))
     pace = np.empty((count, len(time)))
-    # Size of the area of goals [the people's area]: people come as far as its border.
-    goal_area = 1.25
+    goal_area = 1.25  # size of the area of goals [people's area]: people reach its border
     for person, rng in enumerate(rngs):
         drawn = center + half * rng.uniform(-1.0, 1.0, (50, 2))
         clear = np.linalg.norm(drawn[:, None] - starts, axis=-1).min(axis=1, initial=np.inf)
@@ -181,8 +171,7 @@ def take_corner(
     corner = np.array([goal[0], rng.choice([-1.0, 1.0]) * 34.0])
     attackers, markers = np.arange(0, count - 1, 2), np.arange(1, count - 1, 2)
 
-    # Groups of attackers who wait for the ball, an arm's length apart.
-    pack_count = 3
+    pack_count = 3  # groups of attackers who wait for the ball, an arm's length apart
     packs = center + half * rng.uniform([-0.5, -0.6], [0.3, 0.6], (pack_count, 2)) * [out, 1.0]
     homes = packs[rng.integers(pack_count, size=len(attackers))]
     homes = homes + 1.0 * rng.standard_normal(homes.shape)
@@ -206,8 +195,7 @@ def take_corner(
             top[attackers] = 2.0
         marked = attackers[: len(markers)]
         toward = unit(goal - position[marked])
-        # Distance at which a defender marks an attacker, towards the goal [m]: in contact.
-        marking_distance = 0.35
+        marking_distance = 0.35  # towards the goal [m]: in contact
         target[markers] = position[marked] + marking_distance * toward + REACTION * velocity[marked]
         if count:
             target[count - 1] = goal - [out * 0.8, 0.0]
@@ -235,8 +223,7 @@ def run_through(
     crowd: CrowdSettings, duration: float, rng: np.random.Generator
 ) -> list[GroundPath]:
     """Return paths of people who run through the area's middle and back, half of them in pairs."""
-    # Desired lateral distance of pairs of runners [m]; shoulders keep them farther apart.
-    beside = 0.1
+    beside = 0.1  # lateral distance that pairs want [m]; shoulders keep them farther apart
     count, center = crowd.people, np.array(crowd.area_center_m)
     reach = 0.5 * float(min(crowd.area_size_m))
     angle = 2.0 * np.pi * np.arange(count) / max(count, 1) + rng.uniform(-0.3, 0.3, count)
@@ -284,10 +271,8 @@ def play(
     assistants along the touch lines.
     """
     body_space = 1.3  # distance below which players make way for each other [m]
-    # A player that near the target stands [m], until the target is that far away [m].
-    stands = (2.0, 5.0)
-    # Speed wished per metre to the target [1/s]: 10 m away they jog, 20 m away they run hard.
-    eagerness = 0.38
+    stands = (2.0, 5.0)  # a player that near the target stands, until it is that far [m]
+    eagerness = 0.38  # speed per metre to the target [1/s]: 10 m away a jog, 20 m a hard run
     pressing = 2  # players of each team who go for the ball: one on it, one in support
     time = sample_times(duration)
     players = max(crowd.people - crowd.officials, 0)
@@ -338,8 +323,7 @@ def _draw_targets(
     shape = (len(time), len(side))
     # One knot per second, without the jitter of a random walk in between.
     knots = np.arange(time[0], time[-1] + 2.0)
-    # Drift of players from their place in the formation [m], standard deviation per axis.
-    drift_m = 8.0
+    drift_m = 8.0  # from the place in the formation, standard deviation per axis [m]
     roam = drift_m * drift((len(knots), shape[1], 2), roam_time, 1.0, rng)
     roam = interp1d(knots, roam, axis=0)(time)
     aims = rng.uniform([12.0, -10.0], [26.0, 10.0], (shape[1], 2))
@@ -349,8 +333,7 @@ def _draw_targets(
     targets = np.empty((*shape, 2))
     # Formation shift along x and y relative to the ball's displacement [1]: teams stay compact.
     follow = np.array([0.60, 0.45])
-    # The same for goalkeepers, who stay near their goal [1].
-    keeper_follow = np.array([0.12, 0.12])
+    keeper_follow = np.array([0.12, 0.12])  # the same for goalkeepers [1]
     for person in range(shape[1]):
         role, own = (person // 2) % len(FORMATION), roam[:, person]
         if person == players:

@@ -94,14 +94,12 @@ def read_clip(path: Path) -> Clip:
     if np.argmax(np.abs(rise)) == 1:
         points = points[..., [2, 0, 1]]
     length = _leg_length(points)
-    # Units of files [m]; the last is that of the CMU database.
-    file_units = (1.0, 0.01, 0.0254, 0.001, 0.056444)
+    file_units = (1.0, 0.01, 0.0254, 0.001, 0.056444)  # [m]; last, the CMU database's
     points = points * min(file_units, key=lambda metres: abs(np.log(length * metres / usual_leg)))
     across = points[0, 6] - points[0, 7]
     points = points @ _about_z(np.arctan2(-across[0], across[1]))
     start = points[0, 6:8].mean(axis=0)
-    # Height of the ankles above the floor in their lowest frames [m].
-    ankle_height = 0.08
+    ankle_height = 0.08  # above the floor in the lowest frames [m]
     start[2] = np.percentile(points[:, 10:12, 2].min(axis=1), 2.0) - ankle_height
     time = np.arange(len(points), dtype=np.float64) / capture.fps
     return Clip(time, np.asarray(points - start, dtype=np.float64))

@@ -118,8 +118,7 @@ def move_broadcast_camera(
     )
     lag = 0.5  # with which the operator follows the action: a reaction, and a damped head [s]
     sway = 4.0  # drift of the aim off the action along x: operators lead and trail play [m]
-    # Time for which the operator follows the action before the first frame [s].
-    warm_up = 1.5
+    warm_up = 1.5  # for which the operator follows the action before the first frame [s]
     hand = np.arange(times[0] - warm_up, times[-1] + 2.0 * CALM, CALM)
     aim = np.stack([np.interp(hand, action_times, axis) for axis in action.T], axis=-1)
     aim[:, 0] += sway * _smooth(drift(hand.shape, 2.5, 1.0 / CALM, rng), 0.6)

@@ -67,8 +67,7 @@ def draw_body(height: tuple[float, float], rng: np.random.Generator) -> Body:
     betas = np.zeros(model.shapes)
     tall = rng.uniform(height[0], height[1])
     betas[1:] = rng.standard_normal(model.shapes - 1)
-    # Mean and standard deviation of the second beta [1]: wide shoulders, narrow hips, little fat.
-    build = (-1.0, 0.5)
+    build = (-1.0, 0.5)  # of the second beta, mean and spread [1]: wide shoulders, narrow hips
     betas[1] = build[0] + build[1] * betas[1]
     rising = directions[-2, 1] - directions[-1, 1]
     middle = points[-2, 1] - points[-1, 1]
@@ -264,14 +263,12 @@ def _rotate_foot(
     height of the ankle above that of a flat foot, `course` (frames,) [rad] the direction of the
     foot when it treads.
     """
-    # An ankle higher than a standing one by this much no longer levels the foot's roll [m].
-    levelled = 0.15
+    levelled = 0.15  # an ankle higher than a standing one by this levels no roll [m]
     # Upward part of the shank's direction [1]: below the first a foot ignores the ground, as
     # of a lying person; above the second the foot is flat on it.
     treading = (0.25, 0.6)
     down = unit(shank)
-    # Angle by which toes of a foot in the air point down from square with the shank [rad].
-    pointed = np.radians(10.0)
+    pointed = np.radians(10.0)  # of toes of a foot in the air, down from square with the shank
     hanging = np.cos(pointed) * (turned @ _Z) + np.sin(pointed) * down
     treads = _smooth((-down[:, 2] - treading[0]) / (treading[1] - treading[0]))
     free, clear = 4.0 * (1.0 - treads), np.maximum(clear, 0.0)

@@ -173,12 +173,10 @@ def goals(pitch: PitchTemplate) -> Prop:
     aside = np.cross(way, np.where(np.abs(way[:, 2:]) > 0.9, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]))
     aside /= np.linalg.norm(aside, axis=1, keepdims=True)
     above = np.cross(way, aside)
-    # Corners of a tube's cross section.
-    corner_count = 8
+    corner_count = 8  # of a tube's cross section
     turn = 2.0 * np.pi * np.arange(corner_count) / corner_count
     out = np.cos(turn)[:, None] * aside[:, None] + np.sin(turn)[:, None] * above[:, None]
-    # Radius of posts and crossbar [m] (Law 1: at most 12 cm across).
-    radius = 0.06
+    radius = 0.06  # of posts and crossbar [m] (Law 1: at most 12 cm across)
     vertices = tubes[:, :, None] + radius * out[:, None]
     normals = np.broadcast_to(out[:, None], vertices.shape)
     k = np.arange(corner_count)

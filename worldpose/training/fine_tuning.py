@@ -234,12 +234,8 @@ def _read(
     """
 
     def refusal(found: str) -> InputError:
-        return InputError(
-            str(path),
-            expected="a checkpoint of this training",
-            found=found,
-            todo="Remove the file to train from the start, or use the settings of the checkpoint.",
-        )
+        todo = "Remove the file to train from the start, or use the settings of the checkpoint."
+        return InputError(str(path), "a checkpoint of this training", found, todo)
 
     try:
         with safe_open(path, framework="pt") as file:

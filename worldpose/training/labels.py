@@ -262,12 +262,8 @@ def read_picture(path: Path) -> Image:
     except OSError:
         image = None
     if image is None:
-        raise InputError(
-            str(path),
-            expected="a readable image",
-            found="a missing or unreadable file",
-            todo="Put the images of the data set where its annotations say.",
-        )
+        todo = "Put the images of the data set where its annotations say."
+        raise InputError(str(path), "a readable image", "a missing or unreadable file", todo)
     return image
 
 
@@ -309,19 +305,12 @@ def propose_labels(
         InputError: two videos have the same name or different sizes, or one is damaged.
     """
     if folder.exists() and any(folder.iterdir()):
-        raise UsageError(
-            str(folder),
-            expected="an absent or empty folder",
-            found="files",
-            todo="Choose another folder: corrected labels are never overwritten.",
-        )
+        todo = "Choose another folder: corrected labels are never overwritten."
+        raise UsageError(str(folder), "an absent or empty folder", "files", todo)
     if len({video.stem for video in videos}) < len(videos):
-        raise InputError(
-            "videos",
-            expected="files of different names",
-            found=", ".join(video.name for video in videos),
-            todo="Rename one: the images of its frames are named after it.",
-        )
+        expected = "files of different names"
+        todo = "Rename one: the images of its frames are named after it."
+        raise InputError("videos", expected, ", ".join(video.name for video in videos), todo)
     place = folder.resolve()
     place.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{place.name}.", dir=place.parent) as workshop:

@@ -237,12 +237,8 @@ def _require_one(path: Path, packets: Sequence[tuple[int | None, bool, int | Non
 
 def no_video(path: Path, found: str) -> InputError:
     """Return the error of a file that is no video to be read."""
-    return InputError(
-        str(path),
-        expected="a video file with time stamps",
-        found=found,
-        todo="Give an mp4, mov or mkv file; convert others with any video tool.",
-    )
+    todo = "Give an mp4, mov or mkv file; convert others with any video tool."
+    return InputError(str(path), "a video file with time stamps", found, todo)
 
 
 class VideoReader(Pictures):
@@ -284,12 +280,9 @@ class VideoReader(Pictures):
         """
         stop = len(self) if stop is None else stop
         if not 0 <= start <= stop <= len(self):
-            raise InputError(
-                str(self.path),
-                expected=f"frames from 0 to {len(self)}",
-                found=f"{start} to {stop}",
-                todo="Ask for frames that the video has.",
-            )
+            expected = f"frames from 0 to {len(self)}"
+            todo = "Ask for frames that the video has."
+            raise InputError(str(self.path), expected, f"{start} to {stop}", todo)
         for number, picture in self._sound_pictures(start, stop) if start < stop else ():
             self._require_size(number, picture)
             if number >= start and (only is None or number in only):

@@ -51,8 +51,7 @@ def declared_size(content: Image) -> tuple[int, int] | None:
     """
     from PIL import Image as Pillow  # late: few commands open an image
 
-    # EXIF tag of the way in which an image is shown.
-    orientation_tag = 0x0112
+    orientation_tag = 0x0112  # of EXIF: the way in which an image is shown
     try:
         with Pillow.open(io.BytesIO(content.tobytes()), formats=FORMATS) as image:
             width, height = image.size
@@ -99,12 +98,7 @@ class ImageFolder(Pictures):
 
     def damage_error(self, number: int) -> InputError:
         """Return the error of a file that is no image."""
-        return InputError(
-            str(self._files[number]),
-            expected="a picture",
-            found="none",
-            todo="Write it again.",
-        )
+        return InputError(str(self._files[number]), "a picture", "none", "Write it again.")
 
 
 def numbered_images(folder: Path) -> list[tuple[int, Path]]:
@@ -122,12 +116,9 @@ def numbered_images(folder: Path) -> list[tuple[int, Path]]:
     ends = [re.search(r"\d+$", file.stem) for file in files]
     too_long = next((end.group() for end in ends if end and len(end.group()) > digits), None)
     if too_long is not None:
-        raise InputError(
-            str(folder),
-            expected=f"images whose names end in numbers of at most {digits} digits",
-            found=too_long,
-            todo="Name them in order, for example 000123.jpg.",
-        )
+        expected = f"images whose names end in numbers of at most {digits} digits"
+        todo = "Name them in order, for example 000123.jpg."
+        raise InputError(str(folder), expected, too_long, todo)
     numbers = [int(end.group()) for end in ends if end]
     if not files or len(set(numbers)) < len(files):
         raise InputError(
@@ -253,12 +244,8 @@ def median_picture(frames: Iterable[Image], most: int = 64) -> Image:
     """
     band = 64  # rows, which stay in the processor's cache
     if most < 2:
-        raise InputError(
-            "median_picture: most",
-            expected="two frames or more",
-            found=f"{most}",
-            todo="Give for example 64.",
-        )
+        todo = "Give for example 64."
+        raise InputError("median_picture: most", "two frames or more", f"{most}", todo)
     kept: list[Image] = []
     stride = 1
     for index, frame in enumerate(frames):
@@ -297,9 +284,5 @@ def _median_level(pictures: Sequence[Image]) -> Image:
 
 
 def _sizes(found: str) -> InputError:
-    return InputError(
-        "median_picture",
-        expected="one or more frames of one size",
-        found=found,
-        todo="Give frames of one camera's clip.",
-    )
+    todo = "Give frames of one camera's clip."
+    return InputError("median_picture", "one or more frames of one size", found, todo)

@@ -69,12 +69,9 @@ def cut_video(path: Path, start: int, stop: int, out: Path) -> int:
     """
     index = index_frames(path)
     if not 0 <= start < stop <= len(index):
-        raise InputError(
-            str(path),
-            expected=f"a stretch within its {len(index)} pictures",
-            found=f"{start} to {stop}",
-            todo="Request images that the video has.",
-        )
+        expected = f"a stretch within its {len(index)} pictures"
+        todo = "Request images that the video has."
+        raise InputError(str(path), expected, f"{start} to {stop}", todo)
     if index.is_counted:
         raise no_video(path, "one that does not say when each picture is shown")
     with VideoReader(path, index) as source, av.open(str(out), "w") as target:

@@ -84,8 +84,7 @@ def _write(image: Element, group: int, person: AnnotatedPerson) -> None:
     corners = zip(("xtl", "ytl", "xbr", "ybr"), (person.box + CORNER).tolist(), strict=True)
     shape = {name: str(value) for name, value in corners}
     box = SubElement(image, "box", {"label": BOX, "occluded": "0", **shape, **common})
-    # Label of skeletons, whose points are the 17 joints of COCO.
-    skeleton_label = "pose"
+    skeleton_label = "pose"  # its points are the 17 joints of COCO
     skeleton = SubElement(image, "skeleton", {"label": skeleton_label, **common})
     middle = (person.box[:2] + person.box[2:]) / 2  # position of missing keypoints
     for joint, xy, visible in zip(COCO17, person.keypoints, person.visible, strict=True):
@@ -303,8 +302,7 @@ def _result(picture: AnnotatedImage) -> list[dict[str, Any]]:
         "original_height": height,
         "image_rotation": 0,
     }
-    # Displayed size of a keypoint [% of the image width].
-    point_size = 0.3
+    point_size = 0.3  # displayed, of the image width [%]
     for number, person in enumerate(picture.people):
         (x, y), (wide, high) = (
             ((person.box[:2] + CORNER) * percent).tolist(),

@@ -89,9 +89,7 @@ def walk_posture(
     rate [1/min]. `rng` draws the person's manner and gestures, the first step and the gaze.
     """
     still = 0.05  # A slower person keeps both feet down [m/s]
-    # Maximum distance of the hips past a resting ankle; then the heel rises [share of the
-    # leg].
-    roll = 0.5
+    roll = 0.5  # of the hips past a resting ankle at most; then the heel rises [leg]
     flight = 0.05  # rise and fall of a runner's pelvis, peak to peak [share of the leg]
     running_from = (1.9, 2.6)  # speeds between which a walk becomes a run [m/s]
     own_lean = np.radians(3.0 + 3.0 * rng.standard_normal())  # of the trunk, forward

@@ -68,9 +68,7 @@ def read_recordings(folder: Path) -> Recordings:
     Raises:
         InputError: there is no such folder, a file cannot be read, or none has recordings.
     """
-    # A joint this fast at the beginning [m/s] comes from a calibration pose, which is
-    # dropped.
-    jump = 15.0
+    jump = 15.0  # a joint this fast at the beginning ends a calibration pose [m/s]
     expected = "a folder with npz files of motion capture or tracking data"
     if not folder.is_dir():
         raise refuse(

@@ -136,8 +136,7 @@ def _draw_camera(
         image_size=np.array(size),
     )
     beyond = (0.0, 3, 0.0)
-    # Maximum displacement by that swirl, at the corner of an image 1920 px wide [px].
-    max_swirl_px = 0.9
+    max_swirl_px = 0.9  # at the corner of an image 1920 px wide
     if lens == "beyond":
         size_px = rng.uniform(0.3, 1.0) * max_swirl_px * size[0] / 1920.0
         beyond = (float(size_px), int(rng.integers(2, 5)), float(rng.uniform(0.0, 2.0 * np.pi)))
@@ -308,9 +307,7 @@ def draw_pitch(rng: np.random.Generator) -> Pitch:
     """Return a pitch of 90 to 120 by 45 to 90 m with a crown of up to 0.4 m."""
     tape = 0.02  # error of a length measured by tape [m]
     survey = 0.005  # error of a surveyed point, along each axis [m]
-    # Error of painted points against the Laws of the Game, standard deviation along each axis
-    # [m].
-    painting = 0.015
+    painting = 0.015  # error of painted points against the Laws, along each axis [m]
     length, width = float(rng.uniform(90.0, 120.0)), float(rng.uniform(45.0, 90.0))
     if rng.random() < 0.4:
         length, width = 105.0, 68.0
@@ -356,8 +353,7 @@ def click_points(
     """Return a person's clicks, and by wrong name the name of the point under it."""
     misnamed = 0.04  # share of cameras with a click under a wrong name [1]
     click_tail = 4.0  # degrees of freedom of clicks (Student's t) [1]
-    # Spread of one person's clicks in an image of 1920 px, minimum and maximum [px].
-    click_spread = (0.3, 1.1)
+    click_spread = (0.3, 1.1)  # of one person's clicks in an image of 1920 px [px]
     spread = rng.uniform(click_spread[0], click_spread[1]) * np.sqrt(
         camera.camera.image_size[0] / 1920.0
     )
@@ -380,8 +376,7 @@ def click_points(
         for name, xy in zip(chosen, pixels, strict=True)
     )
     drawn: list[DrawnMarking] = []
-    # If an image shows fewer points, lines and arcs are drawn, too [1].
-    few_points = 9
+    few_points = 9  # if an image shows fewer, lines and arcs are drawn, too [1]
     if len(there) < few_points:
         for name in pitch.marking_names:
             course = camera.project(pitch.marking_points(name, 0.3))

@@ -127,8 +127,7 @@ def draw_skeleton(kind: Kind, rng: np.random.Generator) -> Skeleton:
     stature = float(mean + spread * np.clip(rng.standard_normal(), -2.2, 2.2))
     shares = SHARES[kind]
     deviation = np.clip(rng.standard_normal(len(shares)), -2.5, 2.5)
-    # Standard deviation of a person's share relative to the mean [1].
-    share_spread = 0.035
+    share_spread = 0.035  # of a person's share relative to the mean, standard deviation [1]
     own = {
         name: share * (1.0 + share_spread * deviation[i])
         for i, (name, share) in enumerate(shares.items())
@@ -168,8 +167,7 @@ def place_joints(
     `root` (frames, 2) [m] is the middle of the hips in plan, world; `heading` (frames,) is the
     angle from the x axis towards y [rad].
     """
-    # Ratio of the ears' distance before the neck's base to their height above it [1].
-    neck_forward = 0.6
+    neck_forward = 0.6  # ears' distance before the neck's base by their height above it [1]
     frames = len(root)
     turn = _heading_rotations(heading)
     world = {
@@ -256,9 +254,7 @@ def _pelvis_drop(
     hips: Floats, ankles: Floats, planted: Flags, lengths: Floats, fps: float
 ) -> Floats:
     """Return the pelvis' drop (frames,) [m] that puts planted ankles within reach."""
-    # Standard deviation of the smoothing in time of the pelvis' drop into the legs' reach
-    # [s].
-    settling = 0.08
+    settling = 0.08  # smoothing in time of the pelvis' drop, standard deviation [s]
     reach = 0.998 * lengths.sum(axis=0)
     away = np.linalg.norm((ankles - hips)[..., :2], axis=-1)
     highest = ankles[..., 2] + np.sqrt(np.maximum(reach**2 - away**2, 0.0))

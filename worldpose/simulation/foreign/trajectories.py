@@ -148,8 +148,7 @@ def _draw_goal(
 def _repulsion(place: Floats, others: Floats) -> Floats:
     """Return accelerations (persons, 2) [m/s^2] by which people repel each other."""
     body = 0.42  # distance between the middles of two people in contact [m]
-    # Repulsion by a person in contact: acceleration [m/s^2], and its decay distance [m].
-    push = (12.0, 0.25)
+    push = (12.0, 0.25)  # acceleration in contact [m/s^2], and its decay distance [m]
     everyone = np.concatenate([place, others])
     apart = place[:, None] - everyone
     far = np.linalg.norm(apart, axis=-1)
