@@ -110,11 +110,7 @@ def open_npz(path: Path) -> zipfile.ZipFile:
 def check_members(
     path: Path, file: zipfile.ZipFile, members: Mapping[str, Member]
 ) -> tuple[dict[str, zipfile.ZipInfo], dict[str, int]]:
-    """Return the entries of an archive by name, and its named lengths, before anything is loaded.
-
-    Raises:
-        InputError: a member is missing, unknown, or of another type, shape or size than it says.
-    """
+    """Return an archive's entries by name, and named lengths; InputError if not `members`."""
     found = [info.filename for info in file.infolist()]
     names = [name.removesuffix(".npy") for name in found]
     needed = [name for name, member in members.items() if member.required]

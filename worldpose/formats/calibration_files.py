@@ -223,11 +223,7 @@ def _lacks_pose(table: Mapping[str, Any]) -> bool:
 def camera_tables(
     path: Path, content: Mapping[str, Any] | None = None
 ) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-    """Yield place, id and table of each camera of a TOML file, or of its content if that is known.
-
-    Raises:
-        InputError: the file is unreadable, or has an entry that is no table.
-    """
+    """Yield place, id and table of each camera of a TOML file; InputError if an entry is none."""
     content = read_toml(path) if content is None else content
     nested = content.get("cameras")
     tables = nested if isinstance(nested, dict) and "size" not in nested else content
@@ -254,11 +250,7 @@ class Keys(NamedTuple):
 
 
 def read_optics(where: str, table: Mapping[str, Any], keys: Keys = Keys()) -> Optics:  # noqa: B008
-    """Return size, matrix and distortion of a camera's table, whose entries have a form's names.
-
-    Raises:
-        InputError: an entry is missing or misshapen, or the lens has another model.
-    """
+    """Return the optics of a camera's table, by a form's names; InputError if an entry is wrong."""
     matrix = _read_numbers(table, where, keys.matrix, (3, 3))
     size = _read_numbers(table, where, keys.size, (2,))
     numbers = np.ravel(_read_numbers(table, where, keys.distortions, None))

@@ -139,11 +139,7 @@ def form_unit_m(path: Path) -> float:
 
 
 def find_calibration(folder: Path) -> tuple[Form, tuple[Path, ...]]:
-    """Return the form and the files of the one calibration in a folder.
-
-    Raises:
-        InputError: there is none, or more than one; the error lists them.
-    """
+    """Return form and files of the one calibration in a folder; InputError if there is not one."""
     found = calibrations_in(folder)
     if len(found) == 1:
         return found[0]

@@ -33,11 +33,7 @@ _CENTIMETRE: Final = 1e-2
 
 
 def read_camera_json(path: Path, left_out: LeftOut | None) -> dict[str, CameraCalibration]:
-    """Return the cameras of Panoptic Studio or multical, by name.
-
-    Raises:
-        InputError: the file is of neither, or an entry is missing or invalid.
-    """
+    """Return the cameras of Panoptic Studio or multical by name; InputError if it is of neither."""
     content = read_json(path, _JSON_BYTES)
     cameras = content.get("cameras") if isinstance(content, dict) else None
     if isinstance(cameras, list) and all(isinstance(one, dict) for one in cameras):
@@ -142,11 +138,7 @@ def _read_multical(
 
 
 def read_kalibr(path: Path, left_out: LeftOut | None) -> dict[str, CameraCalibration]:
-    """Return the cameras of a Kalibr camchain, in the world of its first camera [m].
-
-    Raises:
-        InputError: the file is no camchain, or an entry is missing or invalid.
-    """
+    """Return the cameras of a Kalibr camchain, in the world of its first one [m]; or InputError."""
     tables = dict(kalibr_tables(path, read_yaml(path), posed=True))
     return _read_tables(path, tables, Keys(), left_out)
 

@@ -90,11 +90,7 @@ def scaled(
 
 
 def toml_unit_m(path: Path, content: Mapping[str, Any] | None = None) -> float:
-    """Return the unit of a TOML file [m]: FreeMoCap's has millimetres, and the ground as z = 0.
-
-    Raises:
-        InputError: FreeMoCap's file has no ground plane.
-    """
+    """Return the unit of a TOML file [m]: FreeMoCap's is mm; InputError if that has no ground."""
     content = read_toml(path) if content is None else content
     # Keys of `metadata` that FreeMoCap alone writes.
     own = {"charuco_square_size", "charuco_board_object", "groundplane_calibration"}
@@ -114,11 +110,7 @@ def toml_unit_m(path: Path, content: Mapping[str, Any] | None = None) -> float:
 
 
 def square_focal(focal: Sequence[float], where: str) -> tuple[float, float]:
-    """Return the mean of fx and fy [px], and half their difference.
-
-    Raises:
-        InputError: they differ too much for square pixels.
-    """
+    """Return the mean of fx and fy [px], and half their difference; InputError if too different."""
     fx, fy = focal
     if abs(fx - fy) > 0.02 * fx:
         expected = "fx and fy of square pixels, within 2 %"

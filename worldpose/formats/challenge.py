@@ -271,11 +271,7 @@ def read_challenge(folder: Path, only: str | None = None) -> dict[str, Challenge
 
 
 def submission_clips(path: Path) -> tuple[str, ...]:
-    """Return the names of the clips of a submission, zipped or bare, without loading them.
-
-    Raises:
-        InputError: there is no such file, or no submission in it.
-    """
+    """Return the names of a submission's clips without loading them; InputError if it is none."""
     if path.suffix.lower() == PARQUET:
         return tuple(_read_table(path, None))
     with _npz_of(path) as file:
@@ -384,11 +380,7 @@ def _by_clip(
 
 
 def read_kit_array(path: Path, kind: str) -> Floats:
-    """Return a clip's array of one kind (`KINDS`): boxes or skeletons.
-
-    Raises:
-        InputError: no npy file of floats of this kind's shape.
-    """
+    """Return a clip's array of one of `KINDS`; InputError if it is no npy of floats so shaped."""
     try:
         with path.open("rb") as stream:
             array = read_npy(stream)

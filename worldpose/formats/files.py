@@ -51,11 +51,7 @@ def bytes_read() -> int:
 
 
 def sha256_of_file(path: Path) -> str:
-    """Return the SHA-256 of a file; `bytes_read` tells its progress, as of a slow disk.
-
-    Raises:
-        OSError: the file is unreadable.
-    """
+    """Return the SHA-256 of a file, or raise OSError; `bytes_read` tells its progress."""
     sha256 = hashlib.sha256()
     with path.open("rb", buffering=0) as file:
         while piece := file.read(CHUNK):
@@ -121,11 +117,7 @@ def parse_yaml(where: str, text: str) -> Any:  # noqa: ANN401
 
 
 def read_json(path: Path, limit: int = SETTINGS_BYTES) -> Any:  # noqa: ANN401
-    """Return the content of a JSON file of at most `limit` bytes, including NaN and Infinity.
-
-    Raises:
-        InputError: no such file, too large or not JSON.
-    """
+    """Return a JSON file of at most `limit` bytes, including NaN and Infinity; or InputError."""
     return parse_json(str(path), read_text(path, limit))
 
 
@@ -135,11 +127,7 @@ def parse_json(where: str, text: str) -> Any:  # noqa: ANN401
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Return the tables of a TOML file.
-
-    Raises:
-        InputError: no such file, too large, a line too long, or not TOML.
-    """
+    """Return the tables of a TOML file; InputError if it is none, too large, or has a long line."""
     # Maximum line length of a TOML file; the time for a key of n dotted parts grows as n
     # squared.
     toml_line = 4096
@@ -153,12 +141,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def require_file(path: Path, limit: int | None = None) -> int:
-    """Return the size of a regular file of at most `limit` bytes, if there is a limit [byte].
-
-    Raises:
-        InputError: there is no such file, it is not a regular file, it is unreachable, or it is
-            too large.
-    """
+    """Return the size of a regular file [byte]; InputError if it is none, or above the limit."""
     try:
         if not path.is_file():
             found = "something else" if path.exists() else "nothing"
@@ -174,11 +157,7 @@ def require_file(path: Path, limit: int | None = None) -> int:
 
 
 def read_text(path: Path, limit: int) -> str:
-    """Return the text of a UTF-8 file of at most `limit` bytes.
-
-    Raises:
-        InputError: no such file, too large, or not UTF-8.
-    """
+    """Return the text of a UTF-8 file; InputError if it is none, or larger than `limit` bytes."""
     require_file(path, limit)
     try:
         return path.read_text(encoding="utf-8-sig")
@@ -272,11 +251,7 @@ class _PlainTree(ElementTree.TreeBuilder):
 
 
 def parse_xml(content: bytes) -> ElementTree.Element:
-    """Return the root element of a document without a document type, and thus without entities.
-
-    Raises:
-        ValueError: the document is not XML, declares a document type, or is nested deeply.
-    """
+    """Return the root of a document; ValueError if it is no XML, nested deeply, or has a type."""
     try:
         return ElementTree.fromstring(content, ElementTree.XMLParser(target=_PlainTree()))
     # ValueError and LookupError: also an encoding unknown to expat or Python.
@@ -319,11 +294,7 @@ class JsonItems:
         self.seen: list[str] = []
 
     def __iter__(self) -> Iterator[Any]:
-        """Yield the entries.
-
-        Raises:
-            InputError: the file is unreadable, is not JSON, or has an entry that is too long.
-        """
+        """Yield the entries; InputError if the file is no JSON, or an entry is too long."""
         try:
             with self.path.open("rb") as file:
                 yield from self._entries(_Text(file))

@@ -43,11 +43,7 @@ class AnimatedBody:
 
 
 def people_with_bodies(path: Path, people: Sequence[AnimatedBody]) -> list[AnimatedBody]:
-    """Return the people who have a body in a frame.
-
-    Raises:
-        InputError: no person has one.
-    """
+    """Return the people who have a body in a frame; InputError if no person has one."""
     present = [person for person in people if person.poses.known.any()]
     if not present:
         todo = "Run the match up to body_fitting, or export joints: --format c3d or csv."

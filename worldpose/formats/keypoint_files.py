@@ -211,11 +211,7 @@ def select_ranges(
 def on_frames(
     path: Path, people: KeypointDetections, ranges: Sequence[tuple[int, int]]
 ) -> KeypointDetections:
-    """Return the people of `path` on exactly these frames; missing frames are NaN.
-
-    Raises:
-        InputError: the frame numbers or the arrays are too large.
-    """
+    """Return people on exactly these frames, NaN where missing; InputError if too many."""
     detections, joints = people.confidence.shape[1:]
     frame_bytes = 8 + 4 * (3 * (joints + len(people.points)) + 5) * detections
     total = sum(count for _, count in ranges)

@@ -29,12 +29,7 @@ def is_storage(file: Path) -> bool:
 
 
 def read_file_storage(file: Path) -> dict[str, Any]:
-    """Return matrices, numbers and lists of text of a file of OpenCV's FileStorage, by name.
-
-    Raises:
-        InputError: the file is too large, or not of that kind, nested too deep, or has none of
-            these.
-    """
+    """Return matrices, numbers and lists of text of OpenCV's FileStorage by name; or InputError."""
     where, text = str(file), read_text(file, SETTINGS_BYTES)
     begin = text.lstrip()[:1]
     words = {"Nan": "NaN", "Inf": "Infinity"}

@@ -291,11 +291,7 @@ def write_csv(path: Path, table: pd.DataFrame, notes: Mapping[str, str]) -> list
 
 
 def write_parquet(path: Path, table: pd.DataFrame, notes: Mapping[str, str]) -> list[Path]:
-    """Write a table as Parquet, with the notes as metadata of its schema; return the file.
-
-    Raises:
-        UsageError: pyarrow is not installed.
-    """
+    """Write a table with notes as its schema's metadata; UsageError without pyarrow."""
     pa, parquet = _import_pyarrow("--format parquet", "choose --format csv")
     content = pa.Table.from_pandas(table, preserve_index=False)
     content = content.replace_schema_metadata({**content.schema.metadata, **notes})

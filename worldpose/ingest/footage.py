@@ -64,11 +64,7 @@ class UnitFrames:
         return int(self.numbers(np.array([frame]))[0])
 
     def place(self, path: Path, people: KeypointDetections) -> KeypointDetections:
-        """Return a file's people, whose frames are the camera's, on the match frames of the ranges.
-
-        Raises:
-            InputError: all people are outside these frames.
-        """
+        """Return people on the match frames of the ranges; InputError if all are outside."""
         frame = self.frame
         number, row = np.unique(self.numbers(frame), return_inverse=True)
         ranges = [(first, last - first + 1) for first, last in stretches(number)]

@@ -182,11 +182,7 @@ def describe_changes(read: Mapping[str, PeopleFile]) -> list[str]:
 def detections_by_camera(
     folder: Path, cameras: Sequence[str], calibration: Path, left_out: LeftOut
 ) -> dict[str, Path]:
-    """Return each camera's file of 2D poses, or its folder `<camera>` or `<camera>_json`.
-
-    Raises:
-        InputError: fewer than two cameras have a file; see `pick_cameras`.
-    """
+    """Return each camera's file of 2D poses, or its folder, as `pick_cameras`."""
     suffixes = (".json", ".npz")
     there = [each for each in sorted(folder.glob("[!.]*")) if each.suffix.lower() in suffixes]
     found: dict[str, Path] = {}

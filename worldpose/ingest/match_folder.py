@@ -75,11 +75,7 @@ class MatchFolder:
     camera_data: Mapping[str, Path] = field(default_factory=dict)
 
     def clip(self, clip_id: str | None = None) -> ClipSpec:
-        """Return the clip with this id, or the first one.
-
-        Raises:
-            InputError: there is none of this id.
-        """
+        """Return the clip with this id, or the first one; InputError if there is none."""
         for clip in self.spec.clips:
             if clip_id in (None, clip.id):
                 return clip
@@ -149,21 +145,13 @@ def read_match(
 
 
 def read_spec(folder: Path) -> MatchSpec:
-    """Return match.yaml of a match folder.
-
-    Raises:
-        InputError: the file is missing or invalid.
-    """
+    """Return match.yaml of a match folder; InputError if it is missing or invalid."""
     with reachable(folder):
         return _read_spec(folder)
 
 
 def spec_around(path: Path) -> tuple[Path, MatchSpec] | None:
-    """Return the match folder that holds a file or folder of results, and its match.yaml.
-
-    Raises:
-        InputError: match.yaml is invalid.
-    """
+    """Return the match folder that holds results, and its match.yaml; InputError if invalid."""
     whole = path.resolve()
     for folder in (whole, *whole.parents[:2]):
         if (folder / "match.yaml").is_file():

@@ -41,11 +41,7 @@ def pitch_file(folder: Path, spec: MatchSpec) -> Path | None:
 
 
 def read_pitch(folder: Path, spec: MatchSpec) -> PitchSpec | None:
-    """Return the surveyed or standard pitch of a match; None without a pitch.
-
-    Raises:
-        InputError: as `pitch_file`, or the file is no pitch.
-    """
+    """Return the surveyed or standard pitch, None without a pitch; InputError if it is invalid."""
     file = pitch_file(folder, spec)
     if spec.pitch == NO_PITCH:
         return None

@@ -129,11 +129,7 @@ def _source_file(folder: Path, path: str, known: dict[tuple[str, int, int], str]
 
 
 def file_state(path: Path) -> tuple[int, int]:
-    """Return the size [byte] and the time of change [ns] of a file, or those of a folder's files.
-
-    Raises:
-        OSError: a file is unreachable.
-    """
+    """Return the size [byte] and time of change [ns] of a file or of a folder's; or OSError."""
     states = [file.stat() for file in (path.iterdir() if path.is_dir() else (path,))]
     return sum(each.st_size for each in states), max((s.st_mtime_ns for s in states), default=0)
 

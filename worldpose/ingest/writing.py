@@ -179,11 +179,7 @@ def _write_pitch(folder: Path, spec: MatchSpec, pitch: PitchSpec) -> None:
 
 
 def write_offsets(folder: Path, offsets: Mapping[str, ClockOffset]) -> None:
-    """Write `offset_frames` [frame] of static cameras into match.yaml; everything else in it stays.
-
-    Raises:
-        InputError: match.yaml is invalid, or has no such camera.
-    """
+    """Write `offset_frames` [frame] of cameras into match.yaml; InputError if one is unknown."""
     file = folder / "match.yaml"
     text = file.read_text(encoding="utf-8")
     root = yaml.compose(text, Loader=yaml.SafeLoader)

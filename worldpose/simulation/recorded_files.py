@@ -57,11 +57,7 @@ class Capture:
     fps: float
 
     def select(self, path: Path, spellings: Mapping[str, Iterable[str]]) -> Floats:
-        """Return joints (frames, points, 3) by the first known of their spellings.
-
-        Raises:
-            InputError: a joint is missing.
-        """
+        """Return joints (frames, points, 3) by their first known spellings, or InputError."""
         known = {name.lower(): number for number, name in enumerate(self.names)}
         found = []
         for name, options in spellings.items():
@@ -91,11 +87,7 @@ def refuse(
 
 
 def read_archive(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the known arrays of an npz file.
-
-    Raises:
-        InputError: it cannot be read, or has pickled objects.
-    """
+    """Return the known arrays of an npz file; InputError if it has pickled objects, or is none."""
     names = ("joints", "joint_names", "fps", "xy", "time", "segment")
     try:
         return read_npz_members(path, names)
@@ -104,11 +96,7 @@ def read_archive(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def read_tracking(path: Path, content: Mapping[str, NDArray[Any]]) -> list[Tracking]:
-    """Return the chunks of a tracking archive.
-
-    Raises:
-        InputError: arrays are missing or have wrong shapes.
-    """
+    """Return the chunks of a tracking archive; InputError if arrays are missing or misshapen."""
     expected = "npz with xy (T, N, 2), and time (T,) or fps"
     xy, fps = content.get("xy", np.empty(0)), content.get("fps", np.array(0.0))
     if xy.ndim != 3 or xy.shape[-1] != 2 or len(xy) == 0 or xy.dtype.kind not in "fiu":
@@ -174,11 +162,7 @@ def turn_along(aim: Floats, going: Flags, begin: float, step: float) -> Floats:
 
 
 def read_capture(path: Path, content: Mapping[str, NDArray[Any]]) -> Capture:
-    """Return the motion of an archive.
-
-    Raises:
-        InputError: arrays are missing or have wrong shapes.
-    """
+    """Return the motion of an archive; InputError if arrays are missing or misshapen."""
     expected = "npz with joints (frames, joints, 3), joint_names (joints,) and fps above 0"
     todo = "Save such a file with numpy.savez, or pass a BVH file."
     if lacking := {"joints", "joint_names", "fps"} - content.keys():

@@ -346,11 +346,7 @@ class Panorama:
 
 
 def render_panorama(cameras: Camera, venue: Venue) -> Panorama:
-    """Return a turning camera's panorama of pitch, boards and stands.
-
-    Raises:
-        InputError: the cameras have different centers.
-    """
+    """Return a turning camera's panorama of the stadium; InputError if its center moves."""
     strip = 512  # width of the strips that are painted one after the other, to save memory [px]
     center = cameras.center[0]
     if not np.allclose(cameras.center, center, rtol=0.0, atol=1e-6):

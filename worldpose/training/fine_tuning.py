@@ -227,11 +227,7 @@ def _write(
 def _read(
     path: Path, net: nn.Module, optimizer: torch.optim.Optimizer, settings: TrainingSettings
 ) -> _State:
-    """Restore weights and moments of a checkpoint in place, and return its state.
-
-    Raises:
-        InputError: the file is no checkpoint, or that of another training.
-    """
+    """Restore weights and moments of a checkpoint in place; return its state, or InputError."""
 
     def refusal(found: str) -> InputError:
         todo = "Remove the file to train from the start, or use the settings of the checkpoint."
@@ -375,11 +371,7 @@ def fine_tune(
 def split(
     pictures: Pictures, settings: FineTuningSettings, kind: NetKind = "people"
 ) -> tuple[list[LabelledPicture], list[LabelledPicture], list[LabelledPicture]]:
-    """Return the frames for training, for validation, and for the test.
-
-    Raises:
-        InputError: a subset without people by whom the metric of this net is measured.
-    """
+    """Return frames for training, validation, test; InputError for one without measured people."""
     people = "people"
     if kind == "keypoints":
         people += f" of {MIN_HEIGHT:g} px or more with a labelled torso and visible keypoints"

@@ -252,11 +252,7 @@ def _picture(
 
 
 def read_picture(path: Path) -> Image:
-    """Return an image (height, width, 3) in RGB.
-
-    Raises:
-        InputError: the file is no readable image.
-    """
+    """Return an image (height, width, 3) in RGB; InputError if the file is none."""
     try:
         image = decode_image(np.fromfile(path, np.uint8))
     except OSError:

@@ -143,11 +143,7 @@ def index_images(folder: Path) -> FrameIndex:
 
 
 def index_video(path: Path) -> FrameIndex:
-    """Return the index of a video file or of a folder of images.
-
-    Raises:
-        InputError: the path is neither a video nor a folder of images.
-    """
+    """Return the index of a video file or of a folder of images; InputError if it is neither."""
     return index_images(path) if path.is_dir() else index_frames(path)
 
 
@@ -178,11 +174,7 @@ def some_pictures(
 def pictures_at(
     video: VideoReader | ImageFolder, numbers: NDArray[np.integer], *, grey: bool = False
 ) -> Iterator[Image | None]:
-    """Yield the frame of each number as `readable_at` does.
-
-    Raises:
-        InputError: a frame cannot be decoded.
-    """
+    """Yield the frame of each number as `readable_at` does; InputError if one is damaged."""
     shown = readable_at(video, numbers, grey=grey)
     for number, picture in zip(numbers.tolist(), shown, strict=True):
         if picture is None and number >= 0:

@@ -152,11 +152,7 @@ class Pictures(ABC):
         """Close what is open: of a folder, nothing."""
 
     def frame(self, number: int) -> Image:
-        """Return one frame (height, width, 3) RGB.
-
-        Raises:
-            InputError: there is no such frame, or it cannot be decoded.
-        """
+        """Return one frame (height, width, 3) RGB; InputError if there is none that decodes."""
         for _, picture in self.frames(number, number + 1):
             return picture
         raise self.damage_error(number)

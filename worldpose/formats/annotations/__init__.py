@@ -62,11 +62,7 @@ def write_annotations(
 
 
 def read_annotations(path: Path, form: Format | None = None) -> list[AnnotatedImage]:
-    """Return the images of a file, in its order; without a format, its content tells it.
-
-    Raises:
-        InputError: the content is invalid; nothing is read.
-    """
+    """Return a file's images, in its order; InputError if invalid. Its content tells the format."""
     most = 1 << 28  # maximum file size [bytes], about that of a hundred thousand people
 
     def decode(content: bytes) -> list[AnnotatedImage]:

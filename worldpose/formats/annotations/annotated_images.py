@@ -120,11 +120,7 @@ def format_attributes(person: AnnotatedPerson) -> dict[str, str]:
 
 
 def read_attributes(given: Mapping[str, str]) -> Attributes:
-    """Parse attributes; unknown names are ignored, an empty text means none.
-
-    Raises:
-        ContentError: a value is invalid.
-    """
+    """Parse attributes without unknown names; empty = none. ContentError if a value is invalid."""
     detection, origin, score = (given.get(name) for name in ("detection", "origin", "score"))
     origins: tuple[Origin, ...] = get_args(Origin)
     if detection and not (detection.isdecimal() and detection.isascii() and len(detection) < 10):
@@ -194,11 +190,7 @@ def coco_bytes(pictures: Sequence[AnnotatedImage]) -> bytes:
 
 
 def read_coco(content: bytes) -> list[AnnotatedImage]:
-    """Read the images of a COCO keypoints file, in its order.
-
-    Raises:
-        ContentError: the file has another format, other joints, or contradictions.
-    """
+    """Read the images of a COCO keypoints file, in its order; ContentError for another form."""
     dataset = _Dataset.model_validate_json(content)
     for category in dataset.categories:
         if category.keypoints not in (None, (), COCO17):

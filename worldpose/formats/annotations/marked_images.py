@@ -68,11 +68,7 @@ class MarkedImage:
 
 
 def read_marked_images(path: Path) -> list[MarkedImage]:
-    """Return the images with shapes of CVAT's XML, Label Studio's, COCO's or SoccerNet's JSON.
-
-    Raises:
-        InputError: the file has none of these forms, or no labelled point or line.
-    """
+    """Return images with shapes of CVAT, Label Studio, COCO, SoccerNet; InputError without any."""
     max_bytes = 1 << 26  # maximum file size [bytes]
 
     def decode(content: bytes) -> list[MarkedImage]:

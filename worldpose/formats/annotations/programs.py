@@ -31,11 +31,7 @@ from worldpose.formats.files import parse_xml
 
 
 def read_xml(content: bytes) -> Element:
-    """Return the root element of a document; see `parse_xml`.
-
-    Raises:
-        ContentError: the document is not XML, declares a document type, or is nested deeply.
-    """
+    """Return the root element of a document; ContentError where `parse_xml` refuses it."""
     try:
         return parse_xml(content)
     except ValueError as error:

@@ -30,11 +30,7 @@ class Method:
     people: Callable[[Path, Poser, tuple[int, int]], Iterator[Person]]
 
     def read(self, path: Path, model: BodyModel, image_size: tuple[int, int]) -> MethodResult:
-        """Return the people of a result, posed with a body, in a video of a size [px].
-
-        Raises:
-            InputError: the file or folder has another layout, or nobody in it.
-        """
+        """Return the people of a result in a video [px]; InputError for another layout."""
         poser = Poser(model)
         people = list(self.people(path, poser, image_size))
         return merge_people(self.world, people, poser.notes, poser.image_size)

@@ -206,11 +206,7 @@ def merge_people(
     notes: Mapping[str, str],
     image_size: tuple[float, float] | None = None,
 ) -> MethodResult:
-    """Merge people with their own frames into one result, NaN where a person is missing.
-
-    Raises:
-        InputError: there are no people.
-    """
+    """Merge people with their own frames, NaN where one is missing; InputError without people."""
     if not people:
         todo = "Check that this is the result for the clip, or run the method again."
         raise InputError("results of a method", "at least one person", "no people", todo)

@@ -63,11 +63,7 @@ class Recordings:
 
 
 def read_recordings(folder: Path) -> Recordings:
-    """Return the motions and tracking data in a folder and the folders in it, by file name.
-
-    Raises:
-        InputError: there is no such folder, a file cannot be read, or none has recordings.
-    """
+    """Return motions and tracking data below a folder by file name; InputError without any."""
     jump = 15.0  # a joint this fast at the beginning ends a calibration pose [m/s]
     expected = "a folder with npz files of motion capture or tracking data"
     if not folder.is_dir():
