@@ -88,10 +88,11 @@ def draw_rig(
     Cameras aim among `action` (places, 3) [m], positions of heads, hips and feet.
     """
     rig: list[RigCamera] = []
-    start = float(rng.uniform(0.0, 2.0 * np.pi))
+    half, start = 0.5 * np.array(field), float(rng.uniform(0.0, 2.0 * np.pi))
     for index in range(count):
         for _ in range(60):
-            drawn = _draw_camera(index, count, start, layout, field, action, rng)
+            place, mounting = _draw_place(index, count, start, layout, half, rng)
+            drawn = _draw_camera(place, mounting, action, rng)
             inside = drawn.sees(drawn.project(action))
             if inside.mean() > (0.5 if layout == "hall" else 0.25):
                 break
@@ -100,15 +101,8 @@ def draw_rig(
 
 
 def _draw_camera(
-    index: int,
-    count: int,
-    start: float,
-    layout: Layout,
-    field: tuple[float, float],
-    action: Floats,
-    rng: np.random.Generator,
+    place: Floats, mounting: str, action: Floats, rng: np.random.Generator
 ) -> RigCamera:
-    place, mounting = _draw_place(index, count, start, layout, field, rng)
     aim = action[rng.integers(len(action))] * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
     share = rng.uniform(0.3, 0.9)
     aim = share * action.mean(axis=0) + (1.0 - share) * aim
@@ -144,15 +138,9 @@ def _draw_camera(
 
 
 def _draw_place(
-    index: int,
-    count: int,
-    start: float,
-    layout: Layout,
-    field: tuple[float, float],
-    rng: np.random.Generator,
+    index: int, count: int, start: float, layout: Layout, half: Floats, rng: np.random.Generator
 ) -> tuple[Floats, str]:
-    """Return a camera's centre (3,) [m] and its position in words."""
-    half = 0.5 * np.array(field)
+    """Return a camera's centre (3,) [m] by half the field (2,) [m], and its position in words."""
     share = (index + rng.uniform(0.2, 0.8)) / count
     if layout == "hall":
         angle = start + 2.0 * np.pi * share
@@ -168,9 +156,8 @@ def _draw_place(
     if kind == "stand":
         back = rng.uniform(10.0, 45.0)
         x = half[0] * (2.2 * share - 1.1)
-        return np.array(
-            [x, -half[1] - back, 4.0 + 0.5 * back * rng.uniform(0.6, 1.1)]
-        ), "main stand"
+        height = 4.0 + 0.5 * back * rng.uniform(0.6, 1.1)
+        return np.array([x, -half[1] - back, height]), "main stand"
     if kind == "goal":
         side = 1.0 if index % 2 else -1.0
         across = half[1] * rng.uniform(-0.7, 0.7)
@@ -318,10 +305,8 @@ def draw_pitch(rng: np.random.Generator) -> Pitch:
         off = painting * rng.standard_normal(3) * [1.0, 1.0, 0.2]
         painted[name] = place + (0.0 if name == "center_mark" else off)
     for name in [name for name in painted if name.endswith("_top")]:
-        foot = painted[name.replace("_top", "_bottom")]
-        painted[name] = foot + np.array(
-            [0.0, 0.0, law[name][2] - law[name.replace("_top", "_bottom")][2]]
-        )
+        foot = name.replace("_top", "_bottom")
+        painted[name] = painted[foot] + np.array([0.0, 0.0, law[name][2] - law[foot][2]])
     true = PitchSpec(length=length, width=width, crown=crown, points=_to_tuples(painted))
     if rng.random() < 0.5:
         surveyed = {n: p + survey * rng.standard_normal(3) for n, p in painted.items()}
@@ -342,8 +327,7 @@ def _to_tuples(places: dict[str, Floats]) -> dict[str, tuple[float, float, float
 def visible_points(camera: RigCamera, pitch: PitchTemplate) -> list[str]:
     """Return the named points of the pitch inside a camera's image."""
     names = list(pitch.points)
-    pixels = camera.project(pitch.positions(names))
-    inside = _is_inside(camera, pixels)
+    inside = _is_inside(camera, camera.project(pitch.positions(names)))
     return [name for name, there in zip(names, inside, strict=True) if there]
 
 
@@ -354,9 +338,7 @@ def click_points(
     misnamed = 0.04  # share of cameras with a click under a wrong name [1]
     click_tail = 4.0  # degrees of freedom of clicks (Student's t) [1]
     click_spread = (0.3, 1.1)  # of one person's clicks in an image of 1920 px [px]
-    spread = rng.uniform(click_spread[0], click_spread[1]) * np.sqrt(
-        camera.camera.image_size[0] / 1920.0
-    )
+    spread = rng.uniform(*click_spread) * np.sqrt(camera.camera.image_size[0] / 1920.0)
     unit = np.sqrt(click_tail / (click_tail - 2.0))
     there = visible_points(camera, pitch)
     chosen = list(rng.permutation(there)[: int(rng.integers(8, 18))])
@@ -383,9 +365,8 @@ def click_points(
             course = course[_is_inside(camera, course)]
             if len(course) < 8 or np.ptp(course, axis=0).max() < 80.0:
                 continue
-            rows = np.sort(
-                rng.choice(len(course), min(len(course), int(rng.integers(4, 11))), False)
-            )
+            count = min(len(course), int(rng.integers(4, 11)))
+            rows = np.sort(rng.choice(len(course), count, False))
             line = course[rows] + 1.3 * spread / unit * rng.standard_t(click_tail, (len(rows), 2))
             drawn.append(DrawnMarking(name=name, xy=tuple(_round_click(camera, xy) for xy in line)))
     markings = ClickedMarkings(points=points, drawn=tuple(drawn))

@@ -28,22 +28,14 @@ STATURE: Final[dict[Kind, tuple[float, float]]] = {
     "child": (1.38, 0.11),
 }
 """Mean and standard deviation [m]; a child of about ten years."""
-SHARES: Final[dict[Kind, dict[str, float]]] = {
-    "man": {
-        **{"thigh": 0.2425, "shank": 0.2493, "ankle": 0.043, "upper_arm": 0.1618},
-        **{"forearm": 0.1545, "trunk": 0.332, "hips": 0.098, "shoulders": 0.205},
-        **{"drop": 0.058, "neck": 0.060, "head": 1.0},
-    },
-    "woman": {
-        **{"thigh": 0.2290, "shank": 0.2500, "ankle": 0.041, "upper_arm": 0.1586},
-        **{"forearm": 0.1523, "trunk": 0.346, "hips": 0.105, "shoulders": 0.194},
-        **{"drop": 0.055, "neck": 0.058, "head": 0.96},
-    },
-    "child": {
-        **{"thigh": 0.2320, "shank": 0.2400, "ankle": 0.046, "upper_arm": 0.1550},
-        **{"forearm": 0.1440, "trunk": 0.338, "hips": 0.096, "shoulders": 0.192},
-        **{"drop": 0.055, "neck": 0.058, "head": 0.93},
-    },
+_BONES: Final = (
+    *("thigh", "shank", "ankle", "upper_arm", "forearm", "trunk", "hips", "shoulders"),
+    *("drop", "neck", "head"),
+)
+SHARES: Final[dict[Kind, tuple[float, ...]]] = {
+    "man": (0.2425, 0.2493, 0.043, 0.1618, 0.1545, 0.332, 0.098, 0.205, 0.058, 0.060, 1.0),
+    "woman": (0.2290, 0.2500, 0.041, 0.1586, 0.1523, 0.346, 0.105, 0.194, 0.055, 0.058, 0.96),
+    "child": (0.2320, 0.2400, 0.046, 0.1550, 0.1440, 0.338, 0.096, 0.192, 0.055, 0.058, 0.93),
 }
 """Bones as shares of stature [1]; `drop`, distance of the shoulders' centres below the neck along
 the trunk; `head`, the size of the face relative to a man's."""
@@ -128,29 +120,21 @@ def draw_skeleton(kind: Kind, rng: np.random.Generator) -> Skeleton:
     shares = SHARES[kind]
     deviation = np.clip(rng.standard_normal(len(shares)), -2.5, 2.5)
     share_spread = 0.035  # of a person's share relative to the mean, standard deviation [1]
-    own = {
-        name: share * (1.0 + share_spread * deviation[i])
-        for i, (name, share) in enumerate(shares.items())
-    }
+    varied = np.array(shares) * (1.0 + share_spread * deviation)
+    own = dict(zip(_BONES, varied, strict=True))
 
     def both(name: str) -> tuple[float, float]:
         uneven = 0.004 * rng.standard_normal()
         length = own[name] * stature
         return length * (1.0 + uneven), length * (1.0 - uneven)
 
-    single = {
-        name: own[name] * stature
-        for name in ("ankle", "trunk", "hips", "shoulders", "drop", "neck")
-    }
+    single = ("ankle", "trunk", "hips", "shoulders", "drop", "neck")
     return Skeleton(
-        kind=kind,
-        stature=stature,
-        thigh=both("thigh"),
-        shank=both("shank"),
-        upper_arm=both("upper_arm"),
-        forearm=both("forearm"),
-        head=own["head"],
-        **single,
+        kind,
+        stature,
+        *(both(name) for name in ("thigh", "shank", "upper_arm", "forearm")),
+        *(own[name] * stature for name in single),
+        own["head"],
     )
 
 
@@ -186,16 +170,12 @@ def place_joints(
     lengths = np.stack([skeleton.thigh, skeleton.shank])
     swung = pelvis[:, None] + hip_offset
     swung = swung + lengths[0][:, None] * limbs["thigh"] + lengths[1][:, None] * limbs["shank"]
-    ankles = np.stack(
-        [
-            _hold_ankle(swung[:, side], posture.planted[:, side], skeleton.ankle, ground)
-            for side in range(2)
-        ],
-        axis=1,
+    held = (
+        _hold_ankle(swung[:, side], posture.planted[:, side], skeleton.ankle, ground)
+        for side in range(2)
     )
-    pelvis[:, 2] -= _pelvis_drop(
-        pelvis[:, None] + hip_offset, ankles, posture.planted, lengths, fps
-    )
+    ankles, hips = np.stack([*held], axis=1), pelvis[:, None] + hip_offset
+    pelvis[:, 2] -= _pelvis_drop(hips, ankles, posture.planted, lengths, fps)
     hips = pelvis[:, None] + hip_offset
     pole = limbs["thigh"] - limbs["shank"] + 0.05 * turn[:, None, :, 0]
     knees, ankles = _solve_knees(hips, ankles, pole, lengths)
@@ -215,16 +195,11 @@ def place_joints(
 
 def _heading_rotations(heading: Floats) -> Floats:
     """Return rotations (frames, 3, 3) from forward, left, up to the world."""
-    cos, sin = np.cos(heading), np.sin(heading)
-    zero, one = np.zeros_like(cos), np.ones_like(cos)
-    return np.stack(
-        [
-            np.stack([cos, -sin, zero], axis=-1),
-            np.stack([sin, cos, zero], axis=-1),
-            np.stack([zero, zero, one], axis=-1),
-        ],
-        axis=-2,
-    )
+    rotations = np.zeros((len(heading), 3, 3))
+    rotations[:, 0, 0] = rotations[:, 1, 1] = np.cos(heading)
+    rotations[:, 1, 0], rotations[:, 0, 1] = np.sin(heading), -np.sin(heading)
+    rotations[:, 2, 2] = 1.0
+    return rotations
 
 
 def _hold_ankle(course: Floats, planted: Flags, ankle: float, ground: Ground) -> Floats:
