@@ -37,11 +37,9 @@ def walk(
 ) -> tuple[Floats, Floats]:
     """Return joints (frames, 17, 3) [m], world, and feet directions of a person on a path.
 
-    Feet point (frames, 2) [rad], left and right, from the x axis towards y, along the path at the
-    time of their placement.
-
-    The path covers `times` (frames,) [s] and a stride before and after. `rng` draws the stride
-    phase at the start of the path and the turns of the head.
+    Feet point (frames, 2) [rad], left and right, from the x axis towards y, along the path when
+    they are placed. The path covers `times` (frames,) [s] and a stride before and after. `rng`
+    draws the stride phase at the start of the path and the turns of the head.
     """
     cycle = stride_cycle(path, rng.random())
     swing = 2.0 * np.pi * np.interp(times, path.time, cycle)
@@ -89,11 +87,9 @@ def walk(
 def stride_cycle(path: GroundPath, phase: float) -> Floats:
     """Return strides made (samples,): whole at mid-stance of the left foot, half at the right's.
 
-    Strides get longer and faster with speed: 0.9 per second at 1 m/s, 1.4 at 4 m/s, 2.2 at 9 m/s.
-    Sources are in docs/explanation/simulation.md.
-    A standing person rests a quarter of the way between the two, with both feet on the ground.
-
-    `phase` is the stride at the start of the path [1], for a person who never stands.
+    Strides get longer and faster with speed; a standing person rests a quarter of the way between
+    the two, both feet on the ground. `phase` is the stride at the start for a person who never
+    stands [1].
     """
     turning_arm = 0.5  # turning by 1 rad/s takes as many steps as walking at this many m/s [m]
     turning = turning_arm * np.abs(np.gradient(path.heading, path.time))
@@ -230,11 +226,10 @@ def gather(
     driven: Sequence[GroundPath] | None = None,
     clip: Clip | None = None,
 ) -> Crowd:
-    """Return the people of a scenario.
+    """Return the people of a scenario, each from a separate stream of random numbers.
 
-    Every person draws from a separate stream; the paths of those who wander, too. `driven` are
-    paths from tracking data, one per person. The third person plays `clip`, the first who is no
-    goalkeeper, or the last of fewer.
+    `driven` are paths from tracking data, one per person. The third person plays `clip`, the first
+    who is no goalkeeper, or the last of fewer.
     """
     settings, duration = scenario.crowd, scenario.duration
     person_seeds = seed.spawn(settings.people if driven is None else len(driven))

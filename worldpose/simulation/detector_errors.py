@@ -1,9 +1,4 @@
-"""Simulated results of image-based methods: keypoint detections and monocular bodies.
-
-A camera reports the detections of all people and of false positives with a detector's errors and
-occlusions, in shuffled order, with boxes and scores. A monocular method estimates bodies in the
-broadcast images.
-"""
+"""Simulated results of image-based methods: a camera's detections, and monocular bodies."""
 
 from __future__ import annotations
 
@@ -325,11 +320,9 @@ def estimate_bodies(
     Arrays: `frame`, `global_orient` (rows, 1, 3, 3) relative to a camera that looks at the crop's
     middle, `body_pose` (rows, 23, 3, 3), `betas` (rows, shapes) without person-specific shape,
     `pred_cam` (rows, 3), the crop's weak perspective: scale and offset [1], `box_center` (rows, 2)
-    [px], `box_size` (rows,) [px], `img_size` (rows, 2) [px]. The order of a frame's rows does not
-    identify persons.
+    [px], `box_size` (rows,) [px], `img_size` (rows, 2) [px]. The order of rows identifies nobody.
 
     `bodies` (frames, persons) are in the world, NaN where missing; `camera` is a batch (frames,).
-    `rng` draws the same numbers for any people in the image.
     """
     frames, persons = bodies.batch_shape
     given = np.concatenate([bodies.global_orient, bodies.body_pose], axis=-1)

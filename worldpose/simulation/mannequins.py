@@ -107,11 +107,7 @@ def shape_people(mannequin: Mannequin, betas: Floats) -> Singles:
 
 
 def pose_people(mannequin: Mannequin, shaped: Singles, poses: BodyParameters) -> Surfaces:
-    """Return posed surfaces.
-
-    `shaped` (persons, vertices, 3) are of `shape_people`; `poses` are a batch (persons,), NaN =
-    missing.
-    """
+    """Return posed surfaces of `shape_people`'s (persons, vertices, 3) [m]; NaN where a pose is."""
     posed = mannequin.body.articulate(poses)
     motions = np.concatenate(
         [posed.rotations, (posed.offsets + poses.transl[:, None])[..., None]], axis=-1

@@ -51,11 +51,8 @@ def simulate_match(
     """Write a synthetic match folder with its ground truth, and return its match.yaml.
 
     The same arguments give the same bytes; docs/explanation/simulation.md describes the files. The
-    match's id names scenario, seed and overrides of the scenario. `out` is absent or an empty
-    folder; the write is atomic. `advance` receives the filming's progress.
-
-    Raises:
-        InputError: `out` holds files, or the trajectories or the capture cannot be used.
+    write is atomic; InputError if `out` holds files, or the trajectories or the capture cannot be
+    used.
     """
     scenario, driven, clip = _apply_options(scenario, options)
     scene = simulate_scene(scenario, seed, driven=driven, clip=clip)

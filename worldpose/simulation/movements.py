@@ -1,8 +1,6 @@
 """Movements of people over the pitch: everyone steers for a target, and bodies touch.
 
-A person accelerates towards a target within the limits of human legs, makes way for others, passes
-in contact on a collision course, and is pushed by bodies in contact. The movements of a scenario
-differ in their targets alone.
+The movements of a scenario differ in their targets alone.
 """
 
 from __future__ import annotations

@@ -123,9 +123,8 @@ def follow_track(
 ) -> tuple[Floats, Floats]:
     """Return places (samples, 2) [m] and headings (samples,) [rad] of a tracked person.
 
-    `times` (samples,) [s] are desired and evenly spaced; `clock` (rows,) [s] and `xy` (rows, 2) [m]
-    are the data, `smoothing_s` is a standard deviation in time, `scale` (2,) that of this pitch to
-    theirs.
+    `times` (samples,) [s] are even; `clock` (rows,) [s] and `xy` (rows, 2) [m] are the data,
+    `smoothing_s` is a standard deviation, `scale` (2,) that of this pitch to theirs.
     """
     fastest = 9.0  # [m/s]
     coast = 0.5  # time in which people come to a stop before and after the data [s]
@@ -177,13 +176,10 @@ def read_capture(path: Path, content: Mapping[str, NDArray[Any]]) -> Capture:
 
 
 def read_bvh(path: Path) -> Capture:
-    """Return the joint positions of a BVH file by forward kinematics.
+    """Return the joint positions of a BVH file by forward kinematics; InputError if it is none.
 
     A joint's rotation is the product of its rotation channels in the file's order; position
     channels replace its offset, the convention of exporters.
-
-    Raises:
-        InputError: not a BVH file, unknown channels, or rows of a wrong length.
     """
     try:
         words = path.read_text(encoding="utf-8", errors="strict").split()

@@ -30,14 +30,10 @@ a runner's path does not."""
 def read_trajectories(
     path: Path, duration: float, max_people: int | None = None
 ) -> tuple[list[GroundPath], float]:
-    """Return paths of the people in a tracking file, and their duration [s].
+    """Return paths of the people in a tracking file, and their duration [s], of at most `duration`.
 
-    The longest chunk is used, with the people who are present in all of it.
-
-    The clip ends after `duration` [s]; people beyond `max_people` are left out, in file order.
-
-    Raises:
-        InputError: unreadable, wrong shapes, or no person present for 0.2 s.
+    The longest chunk is used, with the first `max_people` of those who are present in all of it.
+    InputError if the file is unreadable, has wrong shapes, or nobody is present for 0.2 s.
     """
     chunk = max(read_tracking(path, read_archive(path)), key=lambda each: len(each.clock))
     rows = chunk.clock <= duration + 1e-9
@@ -69,12 +65,7 @@ def read_clip(path: Path) -> Clip:
     """Return a file's motion in metres with z up, from the origin and facing along x.
 
     Up is the axis along which shoulders are above hips, y or z; the unit is the one with plausible
-    leg lengths; the floor is at the lowest ankles.
-
-    The file is BVH, or an npz with `joints` (frames, joints, 3), `joint_names` and `fps`.
-
-    Raises:
-        InputError: unreadable, or joints are missing.
+    leg lengths; the floor is at the lowest ankles. InputError if joints are missing.
     """
     usual_leg = 0.82  # length of thigh and shank together, which identifies the unit of a file [m]
     npz = path.suffix == ".npz"

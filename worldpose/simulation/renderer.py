@@ -1,8 +1,5 @@
 """Images of the simulated stadium: single images, and the broadcast camera's video.
 
-Stage 3 of static calibration must cope with mown stripes, worn and distorted lines, boards full of
-edges, people on the lines, their shadows and that of a stand.
-
 A camera that turns and zooms about a fixed center always stays within one panorama from there: all
 static content is rendered once, finer than any frame, and every frame samples it through its own
 lens.
@@ -49,13 +46,10 @@ from worldpose.simulation.venues import (
 
 
 def outline_shadows(venue: Venue, camera: Camera, vertices: Singles, light: Floats) -> Outlines:
-    """Return outlines of the shadows that surfaces cast on the grass.
+    """Return outlines of the shadows that surfaces (persons, vertices, 3) [m] cast on the grass.
 
-    A vertex casts no shadow beyond the boards, or where the stand's shadow already covers the
-    grass; the stand does not block light that comes straight down.
-
-    `vertices` (persons, vertices, 3) [m], world; `light` is (4,) direction down from it, z = -1,
-    and its share of all light.
+    None beyond the boards, or where the stand's shadow is. `light` is (4,) direction down from it,
+    z = -1, and its share of all light.
     """
     bend, way = venue.bend.astype(np.float32), light[:2].astype(np.float32)
     height = np.maximum(vertices[..., 2] + vertices[..., :2] ** 2 @ bend, np.float32(0.0))
@@ -384,13 +378,7 @@ def render_panorama(cameras: Camera, venue: Venue) -> Panorama:
 def film_broadcast(
     cameras: Camera, venue: Venue, moments: Iterable[Moment]
 ) -> Iterator[RenderedFrame]:
-    """Yield a clip's frames.
-
-    `cameras` is a batch (frames,) with one center; `moments` are the people in every frame.
-
-    Raises:
-        InputError: the cameras have different centers.
-    """
+    """Yield a clip's frames of cameras (frames,); InputError if these have several centers."""
     panorama = render_panorama(cameras, venue)
     grain = sensor_grain(venue, cameras[0])
     width, height = (int(n) for n in cameras.image_size.reshape(-1, 2)[0])

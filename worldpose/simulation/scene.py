@@ -29,14 +29,11 @@ from worldpose.simulation.settings import BroadcastSettings, RigSettings, Scenar
 def place_camera(
     rig: RigSettings, index: int, target: Floats, pitch: PitchSpec, rng: np.random.Generator
 ) -> Camera:
-    """Return the static camera with this number.
+    """Return the static camera with this number: in its seat, or else in a ring beyond the border.
 
-    It has its seat's place, aim and focal length with small random offsets; without a seat, it is
-    in a ring around the target beyond the pitch border. It has a roll of a fraction of a degree, a
-    principal point a few pixels off the centre and the mild barrel distortion (k1, k2) of a stadium
-    lens.
-
-    `target` (3,) [m], world, is the aim of the ring.
+    A seat's place, aim and focal length have small random offsets. Roll, principal point and barrel
+    distortion (k1, k2) are those of a stadium lens. `target` (3,) [m], world, is the aim of the
+    ring.
     """
     if index < len(rig.seats):
         seat = rig.seats[index]
@@ -101,13 +98,11 @@ def move_broadcast_camera(
 ) -> Camera:
     """Return the broadcast camera of every frame, a batch (frames,), with one center.
 
-    Pan and tilt follow a smoothed action through two equal first-order lags, like a damped head;
-    the zoom varies between wide and close. Radial distortion grows with the focal length, as in the
-    released clips: k1 0.1 to 1, k2 0.6 to 4.3.
+    Pan and tilt follow a smoothed action through two equal first-order lags, like a damped head.
+    Radial distortion grows with the focal length, as in released clips: k1 0.1 to 1, k2 0.6 to 4.3.
 
-    `times` (frames,) [s] are those of the camera's own images. `action` (samples, 2) [m], world, is
-    the place of the action at `action_times` (samples,) [s], from 1.5 s before the first frame
-    to the last.
+    `times` (frames,) [s] are those of its images, `action` (samples, 2) [m], world, is the place of
+    the action at `action_times` (samples,) [s], from 1.5 s before the first frame to the last.
     """
     center = np.array(
         [
@@ -270,9 +265,8 @@ def simulate_scene(
     """Return a scene; the same scenario and seed give the same numbers.
 
     Every person and every camera draws from a separate stream: an additional camera changes no
-    existing number, and an additional person no motion of those who wander.
-
-    People are `driven` along paths, instead of the scenario's movement; one of them plays `clip`.
+    existing number, and an additional person no motion of those who wander. People are `driven`
+    along paths instead of the scenario's movement; one of them plays `clip`.
     """
     people_seed, rig_seed, systematic_seed, broadcast_seed, error_seed, survey_seed, click_seed = (
         Seed(seed).spawn(7)

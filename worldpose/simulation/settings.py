@@ -46,13 +46,8 @@ class RenderingSettings(Record):
 class ObservationNoise(Record):
     """Errors of a 2D pose detector on people who are small in the image.
 
-    A joint's error is a bias (`shared_bias_m`, `own_bias_m`, `view_bias`), a part that drifts
-    (`slow`) and one that is independent per frame (`white`, `blur_s`). White noise
-    alone would average out over ten views and fifty frames per second.
-
     Spreads are standard deviations per image axis. Those relative to a person's height in the image
-    are for a joint of average difficulty; each joint's own is in proportion to its COCO sigma (eyes
-    a third, hips four thirds).
+    are for a joint of average difficulty; each joint's own is in proportion to its COCO sigma.
     """
 
     white: float = Field(default=0.015, ge=0, le=10)

@@ -58,11 +58,7 @@ class Body:
 
 
 def draw_body(height: tuple[float, float], rng: np.random.Generator) -> Body:
-    """Return a person of random height [m] within bounds and of random build.
-
-    Proportions are the open body's: all betas but the first are random, the first sets the height.
-    Apart from their build, players vary as the people behind the open body do.
-    """
+    """Return a person of random height [m] within bounds; all betas but the first are random."""
     model, points, directions = _reference_points()
     betas = np.zeros(model.shapes)
     tall = rng.uniform(height[0], height[1])
@@ -149,11 +145,7 @@ class PosedBody:
         return joints
 
     def keypoints(self) -> Floats:
-        """Return the body's COCO-17 keypoints (frames, 17, 3) [m], world.
-
-        Equal to `worldpose.body.fold_keypoints` of `parameters`: of the 17 points only those of the
-        face are on the surface, and only the head moves them.
-        """
+        """Return the body's COCO-17 keypoints (frames, 17, 3) [m], world, as `fold_keypoints`."""
         joints = self.joints()
         keypoints = np.empty((len(joints), 17, 3))
         face = self.body.head - self.body.joints[15]
@@ -179,10 +171,9 @@ class PosedBody:
 def solve_body(body: Body, joints: Floats, ground: Ground, courses: Floats) -> PosedBody:
     """Return the body that follows the motion of a skeleton.
 
-    Hips match the skeleton's, and ankles match its ankles, as far as the legs reach; knees and arms
-    have its planes and directions. Typical human motion completes the parameters that 17 joints
-    leave open: the spine bends and twists evenly, the neck turns half as far as the head, hands
-    continue forearms, feet are flat where they stand and stay above the ground elsewhere.
+    Hips and ankles match the skeleton's as far as the legs reach; knees and arms have its planes
+    and directions. Typical human motion completes the rest: the spine bends and twists evenly, the
+    neck turns half as far as the head, hands continue forearms, feet are flat where they stand.
 
     `joints` (frames, 17, 3) [m], world, are COCO-17, of bones about as long as the body's.
     `courses` (frames, 2) [rad], from the x axis towards y, are directions of left and right foot

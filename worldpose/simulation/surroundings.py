@@ -1,8 +1,6 @@
 """Colours of a stadium's surfaces: grass, painted markings, boards, a track, stands with a crowd.
 
-A pixel is cast back to the surface that it sees. The painted share of a pixel of the crowned pitch
-follows from the distance to each marking over the pixel's footprint there: exact for straight
-edges.
+The painted share of a pixel follows from the distance to each marking over the pixel's footprint.
 """
 
 from __future__ import annotations
@@ -24,13 +22,11 @@ _LINE, _ARC, _SPOT = 0.0, 1.0, 2.0
 
 
 def paint_rows(pitch: PitchTemplate) -> Floats:
-    """Return the painted markings, one row (8,) per marking, for `paint_cover` [m, rad].
+    """Return a row (8,) per painted marking, for `paint_cover` [m, rad], heights above the crown.
 
-    The first number of a row is the kind; heights are above the crown. The rest of a row is
-
-    - for a line: x and y of its start, x and y of its direction, length, height of start and end;
-    - for an arc: x and y of its center, radius, start angle, span, height, 0;
-    - for a spot: x and y of its center, radius, 0, 0, height, 0.
+    A row is its kind and then, of a line, x and y of start and direction, length, height of start
+    and end; of an arc x and y of the center, radius, start angle, span, height, 0; of a spot x and
+    y of the center, radius, 0, 0, height, 0.
     """
     spot_radius = 0.11  # radius of the painted centre and penalty marks [m]
 
@@ -98,8 +94,8 @@ def _share(t: float, du: float, dv: float, low: float, high: float) -> float:
 def paint_cover(paint: Floats, place: Floats) -> float:
     """Return the painted share of a pixel.
 
-    `paint` (n, 8) has the rows of `paint_rows`; `place` (8,) is x y on the surface, their changes
-    by a pixel to the right and one down, and by a metre of height.
+    `paint` (n, 8) is of `paint_rows`; `place` (8,) is x y on the surface, their changes by a pixel
+    to the right and one down, and by a metre of height.
     """
     bare = 1.0
     half = 0.5 * LINE_WIDTH
@@ -245,11 +241,7 @@ def _board(along: float, up: float, side: int, look: int) -> tuple[float, float,
 
 @compile_kernel
 def _crowd(along: float, z: float, side: int, look: int) -> tuple[float, float, float]:
-    """Return the colour at a place of a stand: a seated spectator or an empty seat.
-
-    Head, hair and shoulders in some jacket, a part of each block in the colours of one club: a
-    person detector finds them and a filter must drop them.
-    """
+    """Return the colour at a place of a stand: a spectator that detectors may find, or a seat."""
     row_m = 0.45
     seat_m = 0.52
     row, seat = int(z / row_m), int(along / seat_m)

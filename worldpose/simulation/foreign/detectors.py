@@ -221,9 +221,8 @@ class Filming:
         return self.detector.profile
 
     def detect(self, defined: Floats, lost: float) -> Report:
-        """Return the detections.
+        """Return the detections of the detector's joints (frames, persons, 17, 2) [px].
 
-        `defined` (frames, persons, 17, 2) are pixels of the joints as the detector defines them,
         `lost` is the share of frames that the camera lost.
         """
         profile, view, rng = self.profile, self.view, self.rng

@@ -102,11 +102,7 @@ def simulate_foreign_scene(
     options: MatchOptions = MatchOptions(),  # noqa: B008
     recordings: Recordings | None = None,
 ) -> ForeignScene:
-    """Return a match of the second simulator; the same arguments give the same numbers.
-
-    Of the options, duration, cameras, players and calibrated hold. Without recordings, all motion
-    is computed.
-    """
+    """Return a match, the same for the same arguments; the options of footage do not matter."""
     streams = np.random.SeedSequence([seed, *scenario.name.encode()]).spawn(6)
     rng = np.random.default_rng(streams[0])
     on_pitch = bool(rng.random() < scenario.pitch)
@@ -337,14 +333,9 @@ def simulate_foreign_match(
     options: MatchOptions = MatchOptions(),  # noqa: B008
     recordings: Path | None = None,
 ) -> MatchSpec:
-    """Write a match folder of the second simulator, and return its match.yaml.
+    """Write a match folder of the second simulator as `simulate_match`, and return its match.yaml.
 
-    The same arguments give the same bytes. docs/explanation/simulation.md describes the files.
-    `out` is absent or an empty folder; the write is atomic. See `simulate_foreign_scene` and
-    `read_recordings`.
-
-    Raises:
-        InputError: `out` holds files, or the recordings cannot be used.
+    The recordings are those of `read_recordings`; without, all motion is computed.
     """
     replayed = None if recordings is None else read_recordings(recordings)
     scene = simulate_foreign_scene(scenario, seed, options, replayed)

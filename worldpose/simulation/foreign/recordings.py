@@ -1,8 +1,4 @@
-"""Recordings to replay: motion capture and tracking data, from a folder of npz files.
-
-`worldpose.simulation.recorded_files` describes the files; others are ignored. Motion capture is in
-metres with z up.
-"""
+"""Recordings to replay: motion capture in metres with z up, and tracking data, from npz files."""
 
 from __future__ import annotations
 

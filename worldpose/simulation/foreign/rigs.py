@@ -1,8 +1,4 @@
-"""Rigs of the second simulator: cameras, visibility of people, and what users state.
-
-Rigs have two to forty cameras in halls and stadiums, with mixed resolutions, lenses and mountings.
-Users state clicks in images, cameras from another calibration, and the pitch.
-"""
+"""Rigs in halls and stadiums, visibility of people, and what users state of cameras and pitch."""
 
 from __future__ import annotations
 
