@@ -115,10 +115,7 @@ KINDS: Final = {"boxes": (4,), "skel_2d": ("points", 2), "skel_3d": ("points", 3
 def write_challenge_camera(path: Path, camera: Camera, edition: Edition) -> None:
     """Write cameras/<clip>.npz: every frame's K and k, and R and t of the first frame alone.
 
-    The edition of 2025 repeats R and t as Rt.
-
-    Raises:
-        InputError: the first frame has no camera.
+    The edition of 2025 repeats R and t as Rt. InputError if the first frame has no camera.
     """
     pose = camera.cam_from_world[:1]
     if np.isnan(camera.numbers[0]).any():
@@ -235,9 +232,7 @@ def write_pitch_points(path: Path, points: Floats) -> None:
 def read_challenge(folder: Path, only: str | None = None) -> dict[str, ChallengeClip]:
     """Read the clips of a challenge folder of either edition by name, or `only` the requested one.
 
-    Raises:
-        InputError: the file is absent, has wrong types or shapes, or kinds that disagree; the error
-            names file and place.
+    InputError if the file is absent, has wrong types or shapes, or kinds that disagree.
     """
     kinds: dict[str, dict[str, Floats]] = {}
     for kind in KINDS:
@@ -295,9 +290,7 @@ def read_submission(path: Path, only: Collection[str] | None = None) -> dict[str
 
     It is an npz, zipped or bare, or a table as of 2025, with a row for each joint of sequence,
     frame, person, joint, x, y, z. A table's last persons and frames are those with a joint.
-
-    Raises:
-        InputError: there is no such file, no submission in it, or arrays of another type or shape.
+    InputError if there is no such file, no submission in it, or arrays of another type or shape.
     """
     if path.suffix.lower() == PARQUET:
         return _read_table(path, only)

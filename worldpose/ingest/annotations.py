@@ -41,10 +41,8 @@ def read_clicked(
 ) -> dict[str, ClickedMarkings]:
     """Return the clicks of the static cameras of a match folder, in their order.
 
-    `whose` is the pitch in words, for messages; None = names are not checked.
-
-    Raises:
-        InputError: a file belongs to no static camera, or is invalid.
+    `whose` is the pitch in words, for messages; None = names are not checked. InputError if a file
+    belongs to no static camera, or is invalid.
     """
     static = {camera.id: camera for camera in spec.static_cameras}
     clicked = {}
@@ -60,10 +58,8 @@ def read_clicked_markings(
 ) -> ClickedMarkings:
     """Return the clicks in one camera's image, a JSON of `ClickedMarkings`; see `read_clicked`.
 
-    Raises:
-        InputError: the file is not JSON, or has an unknown key or name, no number, a repeated name,
-            a pixel outside the image, or no clicks, or the match has no pitch; the error names file
-            and entry.
+    InputError if the file is not JSON, or has an unknown key or name, no number, a repeated name, a
+    pixel outside the image, or no clicks, or the match has no pitch.
     """
     template = _template(file, pitch, whose)
     clicked = validate_record(ClickedMarkings, read_json(file), str(file))
@@ -76,8 +72,7 @@ def read_key_frames(
 ) -> dict[str, KeyFrames]:
     """Return the clicked key frames by broadcast view, in their order; see `read_clicked`.
 
-    Raises:
-        InputError: a file belongs to no clip with a broadcast camera, or is invalid.
+    InputError if a file belongs to no clip with a broadcast camera, or is invalid.
     """
     views, picked = spec.broadcast_views, {}
     of_clips = f"<clip>.json of {BROADCAST_FILES}"

@@ -69,9 +69,8 @@ def import_match(
     Returns:
         Content of match.yaml, and sentences about what was found and what was changed.
 
-    Raises:
-        InputError: a file is invalid, names do not match, there are no people, or `out` is not
-            empty; nothing is written then.
+    InputError if a file is invalid, names do not match, there are no people, or `out` is not empty;
+    nothing is written then.
     """
     left_out = LeftOut()
     cameras = read_calibration(calibration, left_out=left_out, any_unit=place is not None)
@@ -206,12 +205,10 @@ def import_lenses(
 ) -> dict[str, LensCalibration]:
     """Write lenses without a pose into a match folder's lenses.toml, and return them.
 
-    Static calibration takes them as prior of focal length, principal point and distortion; the
-    pose comes from clicks. `camera` is the static camera of a file that names none.
-
-    Raises:
-        InputError: a file is invalid (`read_lenses`), its camera is unknown or has a lens already,
-            or calibration.toml gives it with its pose.
+    Static calibration takes them as prior of focal length, principal point and distortion; the pose
+    comes from clicks. `camera` is the static camera of a file that names none. InputError if a file
+    is invalid (`read_lenses`), its camera is unknown or has a lens already, or calibration.toml
+    gives it with its pose.
     """
     spec = read_spec(folder)
     sizes = image_sizes(spec)
@@ -241,10 +238,8 @@ def pick_cameras(
     """Return the file of each camera that has one, of those `found` in a folder by camera.
 
     Files of cameras that are left out are ignored; cameras without a file are added to these, and a
-    sentence about files without a camera. `calibration` and `suffixes` are for messages.
-
-    Raises:
-        InputError: fewer than two cameras have a file, or than all of fewer cameras.
+    sentence about files without a camera. `calibration` and `suffixes` are for messages. InputError
+    if fewer than two cameras have a file, or than all of fewer cameras.
     """
     files = {name: file for name, file in found.items() if name not in left_out}
     both = [name for name in cameras if name in files]
@@ -335,9 +330,8 @@ def import_videos(
     Returns:
         Content of match.yaml, and sentences about what was found and what was changed.
 
-    Raises:
-        InputError: a file is invalid, names or rates do not match, or `out` is not empty; nothing
-            is written then.
+    InputError if a file is invalid, names or rates do not match, or `out` is not empty; nothing is
+    written then.
     """
     with tempfile.TemporaryDirectory(prefix="worldpose-") as joined:
         # A calibration may name its cameras after files that are named as chapters.

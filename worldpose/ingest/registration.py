@@ -33,10 +33,8 @@ def register_match(match: MatchFolder, previous: Registration | None) -> Registr
 
     A file with the size and modification time of the `previous` registration of this folder keeps
     its digest. As in git, this is only a shortcut: it misses a change that preserves both. A video
-    of it that is gone keeps its digest, so that its results stay readable.
-
-    Raises:
-        InputError: a file is empty, unreadable, or still being written.
+    of it that is gone keeps its digest, so that its results stay readable. InputError if a file is
+    empty, unreadable, or still being written.
     """
     with reachable(match.folder):
         return _register(match, previous)
@@ -70,10 +68,7 @@ def _register(match: MatchFolder, previous: Registration | None) -> Registration
 def digest_of_files(path: Path) -> str:
     """Return the SHA-256 of a file, or of the names and contents of a folder's non-hidden files.
 
-    Equals `Registration.digest_of` of the registered files.
-
-    Raises:
-        OSError: a file is unreadable.
+    Equals `Registration.digest_of` of the registered files. OSError if a file is unreadable.
     """
     if not path.is_dir():
         return sha256_of_file(path)
