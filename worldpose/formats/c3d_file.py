@@ -48,7 +48,7 @@ def write_c3d(
     names = tracks.markers.points
     parameters = _parameters(f"person_{tracks.person_ids[person]}", names, count, fps, notes)
     # The start of the data is itself a parameter, whose length does not depend on its value.
-    start = 2 + _blocks(_parameter_section(path, parameters))
+    start = 2 + len(_pad(_parameter_section(path, parameters))) // BLOCK
     parameters["POINT"]["DATA_START"] = np.int16(start)
     section = _parameter_section(path, parameters)
     content = [
@@ -189,10 +189,6 @@ def _encode(where: str, value: _Value) -> bytes:
         return sizes + b"".join(row.ljust(width) for row in rows)
     sizes = struct.pack("<bB", kinds[value.dtype.name], value.ndim) + bytes(value.shape[::-1])
     return sizes + value.tobytes()
-
-
-def _blocks(content: bytes) -> int:
-    return len(_pad(content)) // BLOCK
 
 
 def _pad(content: bytes) -> bytes:

@@ -99,15 +99,12 @@ def read_coco_results(path: Path) -> PeopleFile:
     order = order_by_names(where, names) if names else order_by_points(str(path), points)
     points, changed = clean_points(order.select(points))
     frames = _frames(path, found.images, items.kept.get("images"))
-    people, nobody = people_by_frame(path, frames, points, found.boxes, found.scores, _limit(path))
+    # A full frame pads all others, in a small file too.
+    limit = max(PACKED_BYTES, PACKED_RATIO * path.stat().st_size)
+    people, nobody = people_by_frame(path, frames, points, found.boxes, found.scores, limit)
     nobody, pointless = nobody - pointless, pointless - foreign
     changed = changed._replace(nobody=nobody, pointless=pointless, foreign=foreign)
     return PeopleFile(people, order.name, changed)
-
-
-def _limit(path: Path) -> int:
-    """Return the most bytes of arrays: a full frame pads all others, in a small file too."""
-    return max(PACKED_BYTES, PACKED_RATIO * path.stat().st_size)
 
 
 class _Results(NamedTuple):

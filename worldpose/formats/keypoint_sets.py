@@ -406,7 +406,16 @@ def people_by_frame(
     order = np.argsort(frames, kind="stable")
     frame, first, count = np.unique(frames[order], return_index=True, return_counts=True)
     most = int(count.max(initial=0))
-    _require_room(path, frame, count, points.shape[1], limit)
+    fullest = frame[np.argmax(count)] if len(count) else 0
+    if most > PEOPLE_LIMIT:
+        expected = f"at most {PEOPLE_LIMIT} people per frame"
+        todo = "Check image_id, or keep the detections of each image with the highest scores."
+        raise InputError(str(path), expected, f"{most} in frame {fullest}", todo)
+    limit = min(limit, ARRAY_BYTES)
+    if len(frame) * most * 4 * (3 * points.shape[1] + 5) > limit:
+        expected = f"frames and people that fit into {limit} bytes"
+        todo = "Check image_id."
+        raise InputError(str(path), expected, f"{most} people in frame {fullest}", todo)
     row = np.repeat(np.arange(len(frame)), count)
     slot = np.arange(len(frames)) - np.repeat(first, count)
 
@@ -428,20 +437,3 @@ def people_by_frame(
             people, points=FEET, extra_keypoints=feet[..., :2], extra_confidence=feet[..., 2]
         )
     return people, int((~kept).sum())
-
-
-def _require_room(
-    path: Path, frame: NDArray[np.int64], count: NDArray[np.int64], points: int, limit: int
-) -> None:
-    """Raise InputError for too many people in a frame, or too large arrays."""
-    most = int(count.max(initial=0))
-    fullest = frame[np.argmax(count)] if len(count) else 0
-    if most > PEOPLE_LIMIT:
-        expected = f"at most {PEOPLE_LIMIT} people per frame"
-        todo = "Check image_id, or keep the detections of each image with the highest scores."
-        raise InputError(str(path), expected, f"{most} in frame {fullest}", todo)
-    limit = min(limit, ARRAY_BYTES)
-    if len(frame) * most * 4 * (3 * points + 5) > limit:
-        expected = f"frames and people that fit into {limit} bytes"
-        todo = "Check image_id."
-        raise InputError(str(path), expected, f"{most} people in frame {fullest}", todo)

@@ -234,6 +234,8 @@ def _strides(
     """Return rows of the first and last frame of the strides of one foot."""
     min_swing_m = 0.15  # least travel of the ankle relative to the hips in a stride [m]
     min_stride_s = 0.4  # shortest time between contacts of a foot: sprinters take 2.3 a second
+    max_stride_s = 2.0  # longest stride [s]: in a longer one the person stood
+    min_stride_speed_m_s = 0.5  # slower people stand, turn or shuffle
     from scipy.signal import find_peaks  # late: it takes a second, and reports need no strides
 
     half = max(1, round(0.5 * SPEED_WINDOW_S * fps))
@@ -252,16 +254,11 @@ def _strides(
             ahead[run], distance=max(1, round(min_stride_s * fps)), prominence=min_swing_m
         )
         for a, b in pairwise((contacts + run.start).tolist()):
-            if _is_stride(float(frames[b] - frames[a]) / fps, ankle[b] - ankle[a]):
+            duration = float(frames[b] - frames[a]) / fps
+            speed = float(np.linalg.norm(ankle[b] - ankle[a])) / duration
+            if duration <= max_stride_s and speed >= min_stride_speed_m_s:
                 strides.append((a, b))
     return strides
-
-
-def _is_stride(duration: float, way: Floats) -> bool:
-    min_stride_speed_m_s = 0.5  # slower people stand, turn or shuffle
-    max_stride_s = 2.0  # longest stride [s]: in a longer one the person stood
-    speed = float(np.linalg.norm(way)) / duration
-    return duration <= max_stride_s and speed >= min_stride_speed_m_s
 
 
 def write_csv(path: Path, table: pd.DataFrame, notes: Mapping[str, str]) -> list[Path]:

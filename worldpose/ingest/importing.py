@@ -337,63 +337,49 @@ def import_videos(
         # A calibration may name its cameras after files that are named as chapters.
         is_named = calibration is not None and not join
         found = find_videos(videos, Path(joined) if join else None, named=is_named)
-        return _import_found(calibration, videos, found, out, fps, match_id, boxes, place)
+        if calibration is None:
+            found = without_strays(videos, found, ())
+            require_cameras(videos, found)
+        states = {file: file_state(file) for file in found.values()}
+        indices = {name: index_video(file) for name, file in found.items()}
+        cameras: dict[str, CameraCalibration] = {}
+        notes: list[str] = []
+        files = dict(found)
+        if calibration is not None:
+            left_out = LeftOut()
+            shown = {name: index.size for name, index in indices.items()}
+            cameras = read_calibration(calibration, shown, left_out, any_unit=place is not None)
+            found = without_strays(videos, found, {*cameras, *left_out})
+            is_joined = any(not file.is_relative_to(videos) for file in found.values())
+            if found.keys() - left_out.keys() != cameras.keys() and not is_joined:
+                find_videos(videos)  # raises for chapters
+            endings = VIDEO_SUFFIXES
+            files = pick_cameras(videos, found, list(cameras), calibration, endings, left_out)
+            notes += describe_left_out(left_out)
+            indices = {name: indices[name] for name in files}
+            cameras = {name: cameras[name] for name in files}
+            for name, file in files.items():
+                cameras[name] = fit_to_video(
+                    file, cameras[name], indices[name], notes, of_sensor=is_of_sensor(calibration)
+                )
+        rate = _first_rate(files, indices) if fps is None else fps
+        clocks = {name: index.on_clock(rate, str(files[name])) for name, index in indices.items()}
+        notes += describe_videos(files, indices, clocks)
+        notes += describe_unused(videos, found.values())
+        sizes = {name: index.size for name, index in indices.items()}
+        count = shared_length(map(len, clocks.values()))
+        spec = build_spec(out, match_id, rate, sizes, (0, count), videos=files)
+        if place is not None:
+            cameras, notes[:0] = place(calibration or videos, cameras, {}, rate)
 
+        def copy(match: Path) -> None:
+            copy_videos(files, match)
+            require_settled({files[name]: states[files[name]] for name in files}, "import again")
+            if boxes is not None:
+                copy_boxes(boxes, indices, match, notes)
 
-def _import_found(
-    calibration: Path | None,
-    folder: Path,
-    found: Mapping[str, Path],
-    out: Path,
-    fps: float | None,
-    match_id: str | None,
-    boxes: Path | None,
-    place: Placing | None,
-) -> tuple[MatchSpec, list[str]]:
-    """Write a match folder with these videos; see `import_videos`."""
-    if calibration is None:
-        found = without_strays(folder, found, ())
-        require_cameras(folder, found)
-    states = {file: file_state(file) for file in found.values()}
-    indices = {name: index_video(file) for name, file in found.items()}
-    cameras: dict[str, CameraCalibration] = {}
-    notes: list[str] = []
-    files = dict(found)
-    if calibration is not None:
-        left_out = LeftOut()
-        shown = {name: index.size for name, index in indices.items()}
-        cameras = read_calibration(calibration, shown, left_out, any_unit=place is not None)
-        found = without_strays(folder, found, {*cameras, *left_out})
-        is_joined = any(not file.is_relative_to(folder) for file in found.values())
-        if found.keys() - left_out.keys() != cameras.keys() and not is_joined:
-            find_videos(folder)  # raises for chapters
-        endings = VIDEO_SUFFIXES
-        files = pick_cameras(folder, found, list(cameras), calibration, endings, left_out)
-        notes += describe_left_out(left_out)
-        indices = {name: indices[name] for name in files}
-        cameras = {name: cameras[name] for name in files}
-        for name, file in files.items():
-            cameras[name] = fit_to_video(
-                file, cameras[name], indices[name], notes, of_sensor=is_of_sensor(calibration)
-            )
-    rate = _first_rate(files, indices) if fps is None else fps
-    clocks = {name: index.on_clock(rate, str(files[name])) for name, index in indices.items()}
-    notes += describe_videos(files, indices, clocks)
-    notes += describe_unused(folder, found.values())
-    sizes = {name: index.size for name, index in indices.items()}
-    count = shared_length(map(len, clocks.values()))
-    spec = build_spec(out, match_id, rate, sizes, (0, count), videos=files)
-    if place is not None:
-        cameras, notes[:0] = place(calibration or folder, cameras, {}, rate)
-
-    def copy(match: Path) -> None:
-        copy_videos(files, match)
-        require_settled({files[name]: states[files[name]] for name in files}, "import again")
-        if boxes is not None:
-            copy_boxes(boxes, indices, match, notes)
-
-    write_match(out, spec, calibrations=cameras, observations={}, further=copy)
-    return spec, notes
+        write_match(out, spec, calibrations=cameras, observations={}, further=copy)
+        return spec, notes
 
 
 def _first_rate(files: Mapping[str, Path], indices: Mapping[str, FrameIndex]) -> float:

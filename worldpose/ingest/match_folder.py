@@ -139,13 +139,53 @@ def read_match(
     """
     folder = Path(folder)
     with reachable(folder):
-        return _read_match(folder, known, pitch, whose)
+        spec = read_spec(folder)
+        if not (spec.static_cameras or spec.broadcast_views):
+            raise InputError(
+                f"{folder / 'match.yaml'}: cameras",
+                expected="a static camera, or a clip with a broadcast camera",
+                found=f"{len(spec.cameras)} broadcast, which no clip names",
+                todo=f"Add the static cameras, or `broadcast: {spec.cameras[0].id}` to a clip.",
+            )
+        units = [*(camera.id for camera in spec.static_cameras), *spec.broadcast_views]
+        about = f"a static camera or {BROADCAST_FILES}"
+        detections = files_by_unit(folder, "detections", (".json", ".npz"), units, about)
+        videos = _videos(folder, spec, known)
+        _require_one_view(folder, spec)
+        _require_footage(folder, spec, detections, videos)
+        own = read_pitch(folder, spec)
+        if pitch is None and spec.venue is not None and pitch_file(folder, spec) is None:
+            whose = None
+        clicked_on = pitch or own
+        calibrations = _calibrations(folder, spec)
+        return MatchFolder(
+            folder=folder,
+            spec=spec,
+            calibrations=calibrations,
+            detections=detections,
+            pitch=own,
+            videos=videos,
+            clicked=read_clicked(folder, spec, clicked_on, whose),
+            stills=_stills(folder, spec),
+            key_frames=read_key_frames(folder, spec, clicked_on, whose),
+            lenses=_lenses(folder, spec, calibrations),
+            estimates=_estimates(folder, spec, ".npz"),
+            boxes=_boxes(folder, spec, videos, detections),
+            camera_data=_estimates(folder, spec, CAMERA_DATA),
+        )
 
 
 def read_spec(folder: Path) -> MatchSpec:
     """Return match.yaml of a match folder; InputError if it is missing or invalid."""
     with reachable(folder):
-        return _read_spec(folder)
+        file = folder / "match.yaml"
+        if folder.is_dir() and not file.exists():
+            todo = (
+                "docs/reference/match_folder.md describes a match folder; worldpose import makes "
+                "one from a calibration."
+            )
+            raise InputError(str(file), "a file", "nothing", todo)
+        return validate_record(MatchSpec, read_yaml(file), str(file))
 
 
 def spec_around(path: Path) -> tuple[Path, MatchSpec] | None:
@@ -155,54 +195,6 @@ def spec_around(path: Path) -> tuple[Path, MatchSpec] | None:
         if (folder / "match.yaml").is_file():
             return folder, read_spec(folder)
     return None
-
-
-def _read_spec(folder: Path) -> MatchSpec:
-    file = folder / "match.yaml"
-    if folder.is_dir() and not file.exists():
-        todo = (
-            "docs/reference/match_folder.md describes a match folder; worldpose import makes "
-            "one from a calibration."
-        )
-        raise InputError(str(file), "a file", "nothing", todo)
-    return validate_record(MatchSpec, read_yaml(file), str(file))
-
-
-def _read_match(
-    folder: Path, known: Container[str], clicked_on: PitchSpec | None, whose: str | None
-) -> MatchFolder:
-    spec = read_spec(folder)
-    if not (spec.static_cameras or spec.broadcast_views):
-        raise InputError(
-            f"{folder / 'match.yaml'}: cameras",
-            expected="a static camera, or a clip with a broadcast camera",
-            found=f"{len(spec.cameras)} broadcast, which no clip names",
-            todo=f"Add the static cameras, or `broadcast: {spec.cameras[0].id}` to a clip.",
-        )
-    detections = _detections(folder, spec)
-    videos = _videos(folder, spec, known)
-    _require_one_view(folder, spec)
-    _require_footage(folder, spec, detections, videos)
-    pitch = read_pitch(folder, spec)
-    if clicked_on is None and spec.venue is not None and pitch_file(folder, spec) is None:
-        whose = None
-    clicked_on = clicked_on or pitch
-    calibrations = _calibrations(folder, spec)
-    return MatchFolder(
-        folder=folder,
-        spec=spec,
-        calibrations=calibrations,
-        detections=detections,
-        pitch=pitch,
-        videos=videos,
-        clicked=read_clicked(folder, spec, clicked_on, whose),
-        stills=_stills(folder, spec),
-        key_frames=read_key_frames(folder, spec, clicked_on, whose),
-        lenses=_lenses(folder, spec, calibrations),
-        estimates=_estimates(folder, spec, ".npz"),
-        boxes=_boxes(folder, spec, videos, detections),
-        camera_data=_estimates(folder, spec, CAMERA_DATA),
-    )
 
 
 def require_calibrated(match: MatchFolder) -> None:
@@ -320,12 +312,6 @@ def _stills(folder: Path, spec: MatchSpec) -> dict[str, Path]:
     return stills
 
 
-def _detections(folder: Path, spec: MatchSpec) -> dict[str, Path]:
-    known = [*(camera.id for camera in spec.static_cameras), *spec.broadcast_views]
-    units = f"a static camera or {BROADCAST_FILES}"
-    return files_by_unit(folder, "detections", (".json", ".npz"), known, units)
-
-
 IDENTIFIED: Final = ".npy"
 """Ending of files of boxes of a broadcast view whose rows are the clip's people."""
 CAMERA_DATA: Final = ".csv"
@@ -380,21 +366,16 @@ def _videos(folder: Path, spec: MatchSpec, known: Container[str]) -> dict[str, P
             videos[camera.id] = path_of(usual, str(folder))
     for name, view in spec.broadcast_views.items():
         usual = f"broadcast/{name}.mp4"
-        _require_own_video(folder, name, view.clip)
+        shared = f"broadcast/{view.clip.id}.mp4"
+        if name != view.clip.id and find_file(folder, shared).exists():
+            expected = f"a video of each of the clip's broadcast cameras, as {usual}"
+            todo = "Rename it after the camera that recorded it."
+            raise InputError(f"{folder / shared}", expected, "one video of the clip", todo)
         if view.camera.id in named and not find_file(folder, usual).exists():
             videos[name] = named[view.camera.id]
         elif is_there(usual):
             videos[name] = path_of(usual, str(folder))
     return videos
-
-
-def _require_own_video(folder: Path, view: str, clip: ClipSpec) -> None:
-    """Raise InputError for a video of the clip where each of its cameras has its own."""
-    shared = f"broadcast/{clip.id}.mp4"
-    if view != clip.id and find_file(folder, shared).exists():
-        expected = f"a video of each of the clip's broadcast cameras, as broadcast/{view}.mp4"
-        todo = "Rename it after the camera that recorded it."
-        raise InputError(f"{folder / shared}", expected, "one video of the clip", todo)
 
 
 def _require_one_view(folder: Path, spec: MatchSpec) -> None:
@@ -415,13 +396,13 @@ def _require_footage(
 ) -> None:
     for camera in spec.static_cameras:
         if camera.id not in detections and camera.id not in videos:
-            raise InputError(
-                str(folder),
-                expected=f"footage of every static camera of match.yaml, also of {camera.id}",
-                found=f"missing camera {camera.id}; there: {_list_names({**videos, **detections})}",
-                todo=f"Add videos/{camera.id}.mp4 or detections/{camera.id}.json (or .npz)"
-                f"{_another_video(folder, camera.id)}.",
-            )
+            todo = f"Add videos/{camera.id}.mp4 or detections/{camera.id}.json (or .npz)"
+            others = sorted((folder / "videos").glob(f"{camera.id}.*"))  # of an unusual suffix
+            if named := [file.name for file in others if file.stem == camera.id]:
+                todo += f", or name it in match.yaml: `video: videos/{named[0]}`"
+            expected = f"footage of every static camera of match.yaml, also of {camera.id}"
+            found = f"missing camera {camera.id}; there: {_list_names({**videos, **detections})}"
+            raise InputError(str(folder), expected, found, f"{todo}.")
     for name, view in spec.broadcast_views.items():
         if name not in detections and name not in videos:
             expected = f"footage of broadcast camera {view.camera.id} for clip {view.clip.id}"
@@ -430,13 +411,6 @@ def _require_footage(
                 "take the camera out of `broadcast` of the clip."
             )
             raise InputError(str(folder), expected, "none", todo)
-
-
-def _another_video(folder: Path, camera_id: str) -> str:
-    """Return a hint on a camera's video with an unusual suffix; empty without such a video."""
-    files = sorted((folder / "videos").glob(f"{camera_id}.*"))
-    found = [file.name for file in files if file.stem == camera_id]
-    return f", or name it in match.yaml: `video: videos/{found[0]}`" if found else ""
 
 
 def _list_names(names: Mapping[str, object]) -> str:

@@ -37,32 +37,38 @@ def register_match(match: MatchFolder, previous: Registration | None) -> Registr
     empty, unreadable, or still being written.
     """
     with reachable(match.folder):
-        return _register(match, previous)
-
-
-def _register(match: MatchFolder, previous: Registration | None) -> Registration:
-    folder = str(match.folder.resolve())
-    known: dict[tuple[str, int, int], str] = {}
-    if previous is not None and previous.folder == folder:
-        known = {(file.path, file.size, file.modified_ns): file.sha256 for file in previous.files}
-    identifying = _identifying_files(match)
-    gone = {
-        file.path: file
-        for file in (previous.files if known and previous else ())
-        if match.folder / file.path in match.videos.values()
-        and not (match.folder / file.path).exists()
-    }
-    paths = sorted({*identifying, *_further_files(match)})
-    with ThreadPoolExecutor(READERS) as threads:
-        files = tuple(threads.map(lambda path: _source_file(match.folder, path, known), paths))
-    states = {match.folder / file.path: (file.size, file.modified_ns) for file in files}
-    require_settled(states, "ingest again")
-    files = tuple(sorted((*files, *gone.values()), key=lambda file: file.path))
-    identity = hashlib.sha256()
-    for file in files:
-        if file.path in identifying or file.path in gone:
-            identity.update(f"{file.sha256} {file.path}\n".encode())
-    return Registration(spec=match.spec, folder=folder, identity=identity.hexdigest(), files=files)
+        folder = str(match.folder.resolve())
+        known: dict[tuple[str, int, int], str] = {}
+        if previous is not None and previous.folder == folder:
+            known = {
+                (file.path, file.size, file.modified_ns): file.sha256 for file in previous.files
+            }
+        pitch = pitch_file(match.folder, match.spec)
+        roots = [*match.videos.values(), *match.detections.values(), *([pitch] if pitch else [])]
+        identifying = {path for root in roots for path in _files_under(match.folder, root)}
+        names = ("match.yaml", "calibration.toml", LENS_FILE, "annotations")
+        roots = [*(match.folder / name for name in names), *match.stills.values()]
+        roots += [*match.estimates.values(), *match.boxes.values(), *match.camera_data.values()]
+        further = {path for root in roots for path in _files_under(match.folder, root)}
+        gone = {
+            file.path: file
+            for file in (previous.files if known and previous else ())
+            if match.folder / file.path in match.videos.values()
+            and not (match.folder / file.path).exists()
+        }
+        paths = sorted(identifying | further)
+        with ThreadPoolExecutor(READERS) as threads:
+            files = tuple(threads.map(lambda path: _source_file(match.folder, path, known), paths))
+        states = {match.folder / file.path: (file.size, file.modified_ns) for file in files}
+        require_settled(states, "ingest again")
+        files = tuple(sorted((*files, *gone.values()), key=lambda file: file.path))
+        identity = hashlib.sha256()
+        for file in files:
+            if file.path in identifying or file.path in gone:
+                identity.update(f"{file.sha256} {file.path}\n".encode())
+        return Registration(
+            spec=match.spec, folder=folder, identity=identity.hexdigest(), files=files
+        )
 
 
 def digest_of_files(path: Path) -> str:
@@ -76,19 +82,6 @@ def digest_of_files(path: Path) -> str:
     for name in sorted(_files_under(path, path)):
         listed.update(f"{digest_of_files(path / name)} {name}\n".encode())
     return listed.hexdigest()
-
-
-def _identifying_files(match: MatchFolder) -> set[str]:
-    pitch = pitch_file(match.folder, match.spec)
-    roots = [*match.videos.values(), *match.detections.values(), *([pitch] if pitch else [])]
-    return {path for root in roots for path in _files_under(match.folder, root)}
-
-
-def _further_files(match: MatchFolder) -> set[str]:
-    names = ("match.yaml", "calibration.toml", LENS_FILE, "annotations")
-    roots = [*(match.folder / name for name in names), *match.stills.values()]
-    roots += [*match.estimates.values(), *match.boxes.values(), *match.camera_data.values()]
-    return {path for root in roots for path in _files_under(match.folder, root)}
 
 
 def _files_under(folder: Path, root: Path) -> list[str]:

@@ -77,7 +77,9 @@ def paint_bodies(
         return
     samples = Samples.empty(0, 0, width, height)
     triangles = faces.astype(np.int32)
-    corners = _corners(triangles, bodies.shape[1])
+    ones = np.ones(faces.size, dtype=np.float32)
+    vertices = (triangles.ravel(), np.repeat(np.arange(len(faces)), 3))
+    corners = scipy.sparse.csr_array((ones, vertices), (bodies.shape[1], len(faces)))
     plain = np.zeros(len(faces), dtype=np.bool_), np.zeros((*bodies.shape[1:-1], 2), np.float32)
     for number in inside:
         shade = np.rint(255.0 * colors[number]).astype(np.uint8)
@@ -107,13 +109,6 @@ def _rim(owner: NDArray[np.int16]) -> Flags:
     neighbours = (around[:-2, 1:-1], around[2:, 1:-1], around[1:-1, :-2], around[1:-1, 2:])
     differs = np.any([inner != other for other in neighbours], axis=0)
     return np.asarray(differs & (inner != NOBODY))
-
-
-def _corners(faces: NDArray[np.int32], vertices: int) -> scipy.sparse.csr_array:
-    """Return the vertex-triangle incidence matrix (vertices, triangles)."""
-    number = np.repeat(np.arange(len(faces)), 3)
-    ones = np.ones(faces.size, dtype=np.float32)
-    return scipy.sparse.csr_array((ones, (faces.ravel(), number)), (vertices, len(faces)))
 
 
 def _light(

@@ -113,7 +113,8 @@ def read_journal(store: Store, match_id: str) -> Journal:
             del kept[next(iter(kept))]
     with known.lock:  # concurrent requests read a long journal only once
         journal = known.journal or Journal(match_id)
-        if not _is_still(store, journal, known.last_data):
+        there = journal.last and store.blobs.read(_path(match_id, journal.last))
+        if not journal.last or there != known.last_data:
             journal, known.last_data = Journal(match_id), None
             names = (entry.path.rpartition("/")[2] for entry in store.blobs.entries(folder))
             numbers = sorted(int(found[1]) for found in map(_ENTRY.fullmatch, names) if found)
@@ -158,11 +159,6 @@ def _contents(store: Store, match_id: str, numbers: Sequence[int]) -> list[tuple
     reader_count = 8  # in object storage each entry is a separate request
     with ThreadPoolExecutor(reader_count) as pool:
         return [each for some in pool.map(read, batches) for each in some]
-
-
-def _is_still(store: Store, journal: Journal, last_data: bytes | None) -> bool:
-    """Return whether the last known entry is unchanged; false for an empty journal."""
-    return journal.last > 0 and store.blobs.read(_path(journal.match_id, journal.last)) == last_data
 
 
 def _last(journal: Journal, found: Sequence[tuple[int, bytes]]) -> int:

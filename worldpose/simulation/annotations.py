@@ -158,7 +158,9 @@ def _make_mistake(
     """Return the clicks with one of them wrong, and its name."""
     taken = list(clicked)
     victim = taken[rng.integers(len(taken))]
-    others = [name for name in _confusable_names(victim) if name in names and name not in clicked]
+    pairs = (*CONFUSED, *((other, one) for one, other in CONFUSED))
+    near = [victim.replace(one, other) for one, other in pairs if one in victim]
+    others = [name for name in near if name in names and name not in clicked]
     angle, far = 2.0 * np.pi * rng.random(), rng.uniform(20.0, 60.0)
     if rng.random() < 0.5 and others:
         named = others[rng.integers(len(others))]
@@ -170,12 +172,6 @@ def _make_mistake(
     inward = np.where(clicked[victim] + off < BORDER, 1.0, np.sign(off))
     inward = np.where(clicked[victim] + off > camera.image_size - 1.0 - BORDER, -1.0, inward)
     return {**clicked, victim: clicked[victim] + inward * np.abs(off)}, {victim: victim}
-
-
-def _confusable_names(name: str) -> list[str]:
-    """Return the names that differ from this one by one confused part."""
-    pairs = (*CONFUSED, *((other, one) for one, other in CONFUSED))
-    return [name.replace(one, other) for one, other in pairs if one in name]
 
 
 def _draw_markings(

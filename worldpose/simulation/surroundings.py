@@ -11,7 +11,6 @@ from typing import Final
 import numpy as np
 
 from data_contracts.arrays import Floats
-from data_contracts.pitch import ArcSpec
 from worldpose.compiled import compile_kernel
 from worldpose.pitch.laws import prescribed_points
 from worldpose.pitch.template import PitchTemplate
@@ -39,16 +38,14 @@ def paint_rows(pitch: PitchTemplate) -> Floats:
         (x0, y0, h0), (x1, y1, h1) = above(line.start), above(line.end)
         length = math.hypot(x1 - x0, y1 - y0)
         rows.append((_LINE, x0, y0, (x1 - x0) / length, (y1 - y0) / length, length, h0, h1))
-    rows += [_arc_row(arc, above(arc.center)) for arc in pitch.arcs.values()]
+    for arc in pitch.arcs.values():
+        x, y, h = above(arc.center)
+        span = arc.end_angle - arc.start_angle
+        rows.append((_ARC, x, y, arc.radius, arc.start_angle, span, h, 0.0))
     for name in (name for name in prescribed_points(pitch.spec) if "mark" in name.split("_")):
         x, y, h = above(name)
         rows.append((_SPOT, x, y, spot_radius, 0.0, 0.0, h, 0.0))
     return np.array(rows, dtype=np.float64)
-
-
-def _arc_row(arc: ArcSpec, center: tuple[float, float, float]) -> tuple[float, ...]:
-    x, y, h = center
-    return (_ARC, x, y, arc.radius, arc.start_angle, arc.end_angle - arc.start_angle, h, 0.0)
 
 
 @compile_kernel

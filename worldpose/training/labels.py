@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.conventions import COCO17
@@ -24,6 +24,7 @@ from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import combine_boxes, fuse
 from worldpose.detection.views import as_frame_detector
 from worldpose.errors import InputError, UsageError
+from worldpose.formats.annotations.annotated_images import Given
 from worldpose.formats.keypoint_sets import PointOrder, order_by_names
 from worldpose.video.folder import declared_size, decode_image, open_video
 
@@ -32,13 +33,7 @@ _PEOPLE = re.compile("person|people|human|pedestrian|player|keeper|goalie|refere
 """Words in the names of categories of people."""
 
 
-class _Given(BaseModel):
-    """Part of a foreign data set; unknown keys are ignored."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
-
-
-class _Image(_Given):
+class _Image(Given):
     id: int
     file_name: str = Field(min_length=1)
     width: int | None = None
@@ -48,7 +43,7 @@ class _Image(_Given):
 _Side = Annotated[float, Field(ge=0.0)]
 
 
-class _Person(_Given):
+class _Person(Given):
     image_id: int
     category_id: int | None = None
     bbox: tuple[float, float, _Side, _Side]
@@ -56,7 +51,7 @@ class _Person(_Given):
     iscrowd: int = 0
 
 
-class _Category(_Given):
+class _Category(Given):
     id: int
     name: str | None = None
     supercategory: str | None = None
@@ -68,7 +63,7 @@ class _Category(_Given):
         return bool(self.keypoints) or is_named or self.supercategory in ("person", "people")
 
 
-class _Dataset(_Given):
+class _Dataset(Given):
     images: tuple[_Image, ...]
     annotations: tuple[_Person, ...]
     categories: tuple[_Category, ...] = ()

@@ -107,7 +107,8 @@ def walk_posture(
     ahead = (velocity * np.stack([np.cos(heading), np.sin(heading)], axis=-1)).sum(-1)
     run = np.clip((pace - running_from[0]) / np.diff(running_from), 0.0, 1.0)
     run = run**2 * (3.0 - 2.0 * run)
-    rate = _stride_rate(pace, leg, run) / own_stride
+    walking = 64.8 / 60.0 * (pace / (leg / 0.49)) ** 0.57  # strides per second by Grieve
+    rate = ((1.0 - run) * walking + run * (1.15 + 0.09 * pace)) / own_stride
     cycle = rng.random() + np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * step)])
 
     moving = np.clip(pace / 0.6, 0.0, 1.0)
@@ -163,14 +164,6 @@ def walk_posture(
     for gesture in gestures:
         posture = _add_gesture(posture, gesture, times)
     return posture
-
-
-def _stride_rate(pace: Floats, leg: float, run: Floats) -> Floats:
-    """Return strides per second: walking by Grieve, running linear in speed."""
-    stature = leg / 0.49
-    walking = 64.8 / 60.0 * np.maximum(pace / stature, 0.0) ** 0.57
-    running = 1.15 + 0.09 * pace
-    return np.asarray((1.0 - run) * walking + run * running)
 
 
 def _stride_size(pace: Floats, rate: Floats, leg: float, run: Floats) -> Floats:

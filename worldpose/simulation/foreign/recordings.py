@@ -81,14 +81,14 @@ def read_recordings(folder: Path) -> Recordings:
             joints = dict(zip(JOINTS, np.moveaxis(points, 1, 0), strict=True))
             motions.append(Motion(path.stem, capture.fps, joints))
         elif "xy" in content and content["xy"].ndim == 3:
-            tracks += [each for each in read_tracking(path, content) if _has_players(each)]
+            tracks += [
+                each
+                for each in read_tracking(path, content)
+                if len(each.clock) > 3 and np.isfinite(each.xy).all(axis=(0, 2)).any()
+            ]
     if not motions and not tracks:
         raise refuse(folder, expected, "none")
     return Recordings(tuple(motions), tuple(tracks))
-
-
-def _has_players(track: Tracking) -> bool:
-    return len(track.clock) > 3 and bool(np.isfinite(track.xy).all(axis=(0, 2)).any())
 
 
 def play_motion(
