@@ -21,6 +21,7 @@ from worldpose.body.model import BodyModel, BodyParameters
 from worldpose.errors import InputError, say_failure
 from worldpose.formats.archives import Member, read_archive, write_archive, wrong
 from worldpose.formats.files import whole_file
+from worldpose.formats.release_cameras import camera_arrays
 from worldpose.formats.tables import read_parquet
 from worldpose.geometry.cameras import Camera
 from worldpose.parsing import read_npy
@@ -117,7 +118,6 @@ def write_challenge_camera(path: Path, camera: Camera, edition: Edition) -> None
 
     The edition of 2025 repeats R and t as Rt. InputError if the first frame has no camera.
     """
-    pose = camera.cam_from_world[:1]
     if np.isnan(camera.numbers[0]).any():
         raise wrong(
             str(path),
@@ -125,18 +125,10 @@ def write_challenge_camera(path: Path, camera: Camera, edition: Edition) -> None
             "none",
             "Calibrate the first frame, or export another format.",
         )
-    intrinsics = np.zeros((len(camera.focal), 3, 3))
-    intrinsics[:, (0, 1), (0, 1)] = camera.focal
-    intrinsics[:, :2, 2] = camera.principal_point
-    intrinsics[:, 2, 2] = 1.0
-    arrays = {
-        "K": intrinsics,
-        "k": np.array(camera.distortion[:, :5]),
-        "R": np.array(pose.rotation),
-        "t": np.array(pose.translation),
-    }
+    arrays = camera_arrays(camera)
+    arrays["R"], arrays["t"] = arrays["R"][:1], arrays["t"][:1]
     if edition == 2025:
-        arrays["Rt"] = np.concatenate([pose.rotation, pose.translation[..., None]], axis=-1)
+        arrays["Rt"] = np.concatenate([arrays["R"], arrays["t"][..., None]], axis=-1)
     write_archive(path, arrays)
 
 

@@ -244,8 +244,11 @@ class _Writer:
             part = slice(4 * half, 4 * half + 4)
             self.attributes[f"JOINTS_{half}"] = add(joints[:, part], _VERTICES)
             self.attributes[f"WEIGHTS_{half}"] = add(weights[:, part], _VERTICES)
-        wide = np.uint16 if len(model.template) < 65535 else np.uint32
-        self.indices = add(model.faces.ravel().astype(wide), _INDICES)
+        self.indices = self._add_faces(model.faces, len(model.template))
+
+    def _add_faces(self, triangles: Integers, vertices: int) -> int:
+        wide = np.uint16 if vertices < 65535 else np.uint32
+        return self.file.accessor(triangles.ravel().astype(wide), _INDICES)
 
     def add_person(self, person: AnimatedBody, number: int) -> int:
         """Add a person's joints, motion and surface; return the node."""
@@ -368,33 +371,26 @@ class _Writer:
         """Add the markings as flat strips, above a lawn; return the node."""
         lawn_depth_m = 0.02  # below the lowest marking, which it does not cover
         lawn_margin_m = 4.0  # width of the lawn around the markings [m]
-        lawn, white = (
+        materials = (
             self._add_material(color, 1.0) for color in ((0.12, 0.35, 0.14), (1.0, 1.0, 1.0))
         )
         points = np.concatenate(list(markings))
         low, high = points.min(axis=0), points.max(axis=0)
         (x0, y0), (x1, y1) = low[:2] - lawn_margin_m, high[:2] + lawn_margin_m
         z = low[2] - lawn_depth_m
-        corners = np.array([[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z]], np.float32)
-        up = np.tile(np.array([[0.0, 0.0, 1.0]], np.float32), (4, 1))
-        halves = np.array([0, 1, 2, 0, 2, 3], np.uint16)
-        quad = {
-            "POSITION": self.file.accessor(corners, _VERTICES, bounds=True),
-            "NORMAL": self.file.accessor(up, _VERTICES),
-        }
-        shapes: list[dict[str, Any]] = [
-            {"attributes": quad, "indices": self.file.accessor(halves, _INDICES), "material": lawn}
-        ]
-        vertices, triangles = paint_strips(markings)
-        painted = {
-            "POSITION": self.file.accessor(vertices.astype(np.float32), _VERTICES, bounds=True),
-            "NORMAL": self.file.accessor(
-                np.broadcast_to(up[:1], vertices.shape).astype(np.float32), _VERTICES
-            ),
-        }
-        wide = np.uint16 if len(vertices) < 65535 else np.uint32
-        faces = self.file.accessor(triangles.ravel().astype(wide), _INDICES)
-        shapes.append({"attributes": painted, "indices": faces, "material": white})
+        corners = np.array([[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z]])
+        lawn = corners, np.array([[0, 1, 2], [0, 2, 3]])
+        shapes, add = [], self.file.accessor
+        for (vertices, triangles), material in zip(
+            (lawn, paint_strips(markings)), list(materials), strict=True
+        ):
+            up = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (len(vertices), 1))
+            attributes = {
+                "POSITION": add(vertices.astype(np.float32), _VERTICES, bounds=True),
+                "NORMAL": add(up, _VERTICES),
+            }
+            faces = self._add_faces(triangles, len(vertices))
+            shapes.append({"attributes": attributes, "indices": faces, "material": material})
         mesh = self.file.add("meshes", {"name": "pitch", "primitives": shapes})
         return self.file.add("nodes", {"name": "pitch", "mesh": mesh})
 

@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.cameras import CameraCalibration
 from worldpose.formats.archives import Member, read_archive, write_archive, wrong
 from worldpose.formats.calibration_unit import other_middle
@@ -49,15 +50,18 @@ def write_static_camera(path: Path, calibration: CameraCalibration) -> None:
 
 def write_moving_camera(path: Path, camera: Camera) -> None:
     """Write a moving camera (frames,) in the same layout; NaN where a frame has no camera."""
+    write_archive(path, camera_arrays(camera))
+
+
+def camera_arrays(camera: Camera) -> dict[str, Floats]:
+    """Return `MEMBERS` of a moving camera (frames,)."""
     intrinsics = np.zeros((len(camera.focal), 3, 3))
     intrinsics[:, (0, 1), (0, 1)] = camera.focal
     intrinsics[:, :2, 2] = camera.principal_point
     intrinsics[:, 2, 2] = 1.0
     pose = camera.cam_from_world
-    write_archive(
-        path,
-        {"K": intrinsics, "k": camera.distortion[:, :5], "R": pose.rotation, "t": pose.translation},
-    )
+    distortion = camera.distortion[:, :5]
+    return {"K": intrinsics, "k": distortion, "R": pose.rotation, "t": pose.translation}
 
 
 def read_camera(path: Path, image_size: tuple[int, int] | None = None) -> Camera:

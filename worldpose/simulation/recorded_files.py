@@ -181,28 +181,18 @@ def read_bvh(path: Path) -> Capture:
     A joint's rotation is the product of its rotation channels in the file's order; position
     channels replace its offset, the convention of exporters.
     """
-    try:
-        words = path.read_text(encoding="utf-8", errors="strict").split()
-    except (OSError, UnicodeDecodeError) as error:
-        raise _refuse_bvh(path, str(error)) from error
-    reader = _Reader(path, words)
-    reader.expect("HIERARCHY")
-    reader.expect("ROOT")
+    reader = _Reader(path)
+    reader.expect("HIERARCHY", "ROOT")
     reader.joint(-1)
-    reader.expect("MOTION")
-    reader.expect("Frames:")
+    reader.expect("MOTION", "Frames:")
     frames = reader.number()
-    reader.expect("Frame")
-    reader.expect("Time:")
+    reader.expect("Frame", "Time:")
     frame_time = reader.number()
-    values = reader.rest()
+    values = np.array([reader.number() for _ in reader.words[reader.place :]])
     width = sum(len(channels) for channels in reader.channels)
     if frames < 1 or frame_time <= 0.0 or len(values) != round(frames) * width:
-        raise _refuse_bvh(
-            path,
-            f"{frames:g} frames of {width} channels every {frame_time:g} s, and {len(values)} "
-            "numbers",
-        )
+        said = f"{frames:g} frames of {width} channels every {frame_time:g} s"
+        raise reader.refuse(f"{said}, and {len(values)} numbers")
     rows = values.reshape(round(frames), width)
     positions = _positions(np.array(reader.offsets), reader.parents, reader.channels, rows)
     return Capture(tuple(reader.names), positions, 1.0 / frame_time)
@@ -211,23 +201,33 @@ def read_bvh(path: Path) -> Capture:
 class _Reader:
     """Tokens of a BVH file and the joints read so far."""
 
-    def __init__(self, path: Path, words: list[str]) -> None:
-        self.path, self.words, self.place = path, words, 0
+    def __init__(self, path: Path) -> None:
+        self.path, self.place = path, 0
+        try:
+            self.words = path.read_text(encoding="utf-8", errors="strict").split()
+        except (OSError, UnicodeDecodeError) as error:
+            raise self.refuse(str(error)) from error
         self.names: list[str] = []
         self.parents: list[int] = []
         self.offsets: list[list[float]] = []
         self.channels: list[tuple[str, ...]] = []
 
+    def refuse(self, found: str) -> InputError:
+        expected = "a BVH file: HIERARCHY, MOTION, and as many numbers as frames times channels"
+        todo = "Export the clip again with six or three channels per joint."
+        return refuse(self.path, expected, found, todo)
+
     def word(self) -> str:
         if self.place >= len(self.words):
-            raise _refuse_bvh(self.path, "the file ends too early")
+            raise self.refuse("the file ends too early")
         self.place += 1
         return self.words[self.place - 1]
 
-    def expect(self, what: str) -> None:
-        found = self.word()
-        if found.upper() != what.upper():
-            raise _refuse_bvh(self.path, f"{found!r} as word {self.place} instead of {what!r}")
+    def expect(self, *words: str) -> None:
+        for what in words:
+            found = self.word()
+            if found.upper() != what.upper():
+                raise self.refuse(f"{found!r} as word {self.place} instead of {what!r}")
 
     def number(self) -> float:
         word = self.word()
@@ -236,11 +236,8 @@ class _Reader:
         except ValueError:
             number = np.nan
         if not np.isfinite(number):
-            raise _refuse_bvh(self.path, f"{word!r} as word {self.place} instead of a number")
+            raise self.refuse(f"{word!r} as word {self.place} instead of a number")
         return number
-
-    def rest(self) -> Floats:
-        return np.array([self.number() for _ in range(len(self.words) - self.place)])
 
     def joint(self, parent: int) -> None:
         """Read a joint from its name to its closing brace, and its children."""
@@ -249,20 +246,19 @@ class _Reader:
         name = self.word()
         self.names.append(f"{self.names[parent]}_end" if ends else name)
         self.parents.append(parent)
-        self.expect("{")
-        self.expect("OFFSET")
+        self.expect("{", "OFFSET")
         self.offsets.append([self.number() for _ in range(3)])
         self.channels.append(())
         while (word := self.word()) != "}":
             if word.upper() == "CHANNELS" and not ends:
                 channels = tuple(self.word() for _ in range(round(self.number())))
                 if unknown := sorted(set(channels) - set(_CHANNELS)):
-                    raise _refuse_bvh(self.path, f"channels {', '.join(unknown)} of {name}")
+                    raise self.refuse(f"channels {', '.join(unknown)} of {name}")
                 self.channels[index] = channels
             elif word in ("JOINT", "End") and not ends:
                 self.joint(index)
             else:
-                raise _refuse_bvh(self.path, f"{word!r} as word {self.place} within {name}")
+                raise self.refuse(f"{word!r} as word {self.place} within {name}")
 
 
 def _positions(
@@ -299,9 +295,3 @@ def _about(axis: int, angle: Floats) -> Floats:
     rotation[:, one, one] = rotation[:, other, other] = np.cos(angle)
     rotation[:, other, one], rotation[:, one, other] = np.sin(angle), -np.sin(angle)
     return rotation
-
-
-def _refuse_bvh(path: Path, found: str) -> InputError:
-    expected = "a BVH file: HIERARCHY, MOTION, and as many numbers as frames times channels"
-    todo = "Export the clip again with six or three channels per joint."
-    return refuse(path, expected, found, todo)

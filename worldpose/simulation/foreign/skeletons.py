@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
@@ -121,21 +121,13 @@ def draw_skeleton(kind: Kind, rng: np.random.Generator) -> Skeleton:
     deviation = np.clip(rng.standard_normal(len(shares)), -2.5, 2.5)
     share_spread = 0.035  # of a person's share relative to the mean, standard deviation [1]
     varied = np.array(shares) * (1.0 + share_spread * deviation)
-    own = dict(zip(_BONES, varied, strict=True))
-
-    def both(name: str) -> tuple[float, float]:
+    own: dict[str, Any] = dict(zip(_BONES, varied, strict=True))
+    for name in own.keys() - {"head"}:
+        own[name] *= stature
+    for name in ("thigh", "shank", "upper_arm", "forearm"):
         uneven = 0.004 * rng.standard_normal()
-        length = own[name] * stature
-        return length * (1.0 + uneven), length * (1.0 - uneven)
-
-    single = ("ankle", "trunk", "hips", "shoulders", "drop", "neck")
-    return Skeleton(
-        kind,
-        stature,
-        *(both(name) for name in ("thigh", "shank", "upper_arm", "forearm")),
-        *(own[name] * stature for name in single),
-        own["head"],
-    )
+        own[name] = own[name] * (1.0 + uneven), own[name] * (1.0 - uneven)
+    return Skeleton(kind, stature, **own)
 
 
 def place_joints(
