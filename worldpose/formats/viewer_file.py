@@ -241,11 +241,10 @@ def decode_part(part: bytes) -> tuple[dict[str, Any], Arrays]:
 
 
 def decode_bodies(scene: bytes, frames: bytes) -> tuple[Floats, Floats]:
-    """Return the bodies of a range as the viewer poses them.
+    """Return the bodies of a range as the viewer poses them, in the order of the scene's people.
 
-    Returns:
-        Rotations (frames, bodies, 24, 3, 3) relative to the world, and joints (frames, bodies,
-        24, 3) [m], NaN where a person has no body. Bodies are in the order of the scene's people.
+    They are rotations (frames, bodies, 24, 3, 3) relative to the world, and joints (frames, bodies,
+    24, 3) [m], NaN where a person has no body.
     """
     _, fixed = decode_part(scene)
     _, moving = decode_part(frames)

@@ -214,10 +214,8 @@ def require_footage(
 ) -> dict[str, InputError]:
     """Raise InputError as `read_footage` if a video contradicts match.yaml.
 
-    With `whole`, the video also has the first and the last frame of its clips.
-
-    Returns:
-        For each clip of which the video has no image, the error if no other camera has one.
+    With `whole`, the video also has the first and the last frame of its clips. Returned is, for
+    each clip of which the video has no image, the error if no other camera has one.
     """
     frames, clips = unit_frames(spec, unit_id), footage_clips(spec, unit_id)
     fps = spec.fps * frames.rate

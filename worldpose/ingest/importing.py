@@ -65,10 +65,7 @@ def import_match(
     for each. The match's id is by default the name of `out`, which is absent or empty. The pitch is
     "none", or None for the standard pitch, if the calibration's world is the pitch's. `place`
     brings the cameras to metres with z up; None = they are.
-
-    Returns:
-        Content of match.yaml, and sentences about what was found and what was changed.
-
+    Returned are the content of match.yaml, and sentences about what was found and changed.
     InputError if a file is invalid, names do not match, there are no people, or `out` is not empty;
     nothing is written then.
     """
@@ -324,12 +321,8 @@ def import_videos(
     `videos` has a video, or a folder of numbered images, for each camera, called as the camera;
     `boxes` has `<camera>.txt` of people's boxes (`read_boxes`), in which only poses are estimated,
     for some of the cameras or all. `fps` is by default that of the videos; images have none. With
-    `join`, chapters of one recording, as GoPro names them, become one video. Id, `out` and `place`
-    are as in `import_match`.
-
-    Returns:
-        Content of match.yaml, and sentences about what was found and what was changed.
-
+    `join`, chapters of one recording, as GoPro names them, become one video. Id, `out`, `place`
+    and the result are as in `import_match`.
     InputError if a file is invalid, names or rates do not match, or `out` is not empty; nothing is
     written then.
     """

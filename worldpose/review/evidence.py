@@ -217,16 +217,12 @@ def check_views(cameras: Camera, keypoints: ArrayLike) -> ViewCheck:
 
 def _joints(cameras: Camera, rays: Rays, chosen: Floats) -> Floats:
     """Return joints (choices, joints, 3) [m] from the cameras of each choice (choices, cameras)."""
-    bundles = Rays(
-        origins=np.broadcast_to(rays.origins, rays.directions.shape).swapaxes(0, 1),
-        directions=rays.directions.swapaxes(0, 1),
-        status=rays.status.swapaxes(0, 1),
-    )
-    share = np.broadcast_to(chosen[:, None, :], (len(chosen), *bundles.status.shape))
+    origins = np.broadcast_to(rays.origins, rays.directions.shape).swapaxes(0, 1)
+    share = np.broadcast_to(chosen[:, None, :], (len(chosen), *origins.shape[:2]))
     many = Rays(
-        origins=np.broadcast_to(bundles.origins, (*share.shape, 3)),
-        directions=np.broadcast_to(bundles.directions, (*share.shape, 3)),
-        status=np.broadcast_to(bundles.status, share.shape),
+        origins=np.broadcast_to(origins, (*share.shape, 3)),
+        directions=np.broadcast_to(rays.directions.swapaxes(0, 1), (*share.shape, 3)),
+        status=np.broadcast_to(rays.status.swapaxes(0, 1), share.shape),
     )
     near, _ = intersect_rays(many, share)
     distance = np.linalg.norm(near[..., None, :] - cameras.center, axis=-1)

@@ -196,9 +196,7 @@ def _extend(journal: Journal, found: Sequence[tuple[int, bytes]], folder: str) -
 def append(store: Store, journal: Journal, records: Sequence[ReviewRecord]) -> Journal | None:
     """Return the journal as read with one more entry of all records, which is durable on return.
 
-    Returns:
-        None if another writer added an entry since: nothing is written; read and decide again.
-
+    None if another writer added an entry since: nothing is written; read and decide again.
     StoreError if the store cannot write the entry; nothing is written.
     """
     number = journal.last + 1

@@ -255,11 +255,7 @@ def read_picture(path: Path) -> Image:
 
 
 class PictureCache:
-    """Images by path, in a cache that evicts the least recently used.
-
-    Args:
-        most: largest size of the cache [byte].
-    """
+    """Images by path, at most `most` bytes in a cache that evicts the least recently used."""
 
     def __init__(self, most: int = 3 << 30) -> None:
         self._most, self._size = most, 0
