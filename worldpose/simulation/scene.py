@@ -308,7 +308,14 @@ def simulate_scene(
     for number, settings in enumerate(scenario.broadcast):
         place, detections = broadcast_seed.spawn(2)
         name = view_name(scenario, number)
-        broadcast[name] = view = _move(settings, scenario, crowd, len(times), _rng(place))
+        fps = settings.fps or scenario.fps
+        size = settings.image_size_px or scenario.rig.image_size_px
+        nearest = camera_frames(np.arange(len(times)), 0.0, fps / scenario.fps)
+        own_times = np.arange(nearest[-1] + 1) / fps
+        camera = move_broadcast_camera(
+            settings, own_times, crowd.action, crowd.action_times, size, _rng(place)
+        )
+        broadcast[name] = view = MovingView(camera, fps, nearest)
         seen = joints if view.fps == scenario.fps else crowd.joints(view.times)
         faster = detector.at_rate(view.fps)
         reports[name], _ = faster.film(view.camera, seen, crowd.heights, _rng(detections))
@@ -336,22 +343,6 @@ def view_name(scenario: Scenario, number: int) -> str:
 def broadcast_id(number: int) -> str:
     """Return the id of a broadcast camera."""
     return f"broadcast{number + 1}" if number else "broadcast"
-
-
-def _move(
-    settings: BroadcastSettings,
-    scenario: Scenario,
-    crowd: Crowd,
-    frames: int,
-    rng: np.random.Generator,
-) -> MovingView:
-    """Return a moving camera at its own frame rate, over this number of match frames."""
-    fps = settings.fps or scenario.fps
-    number = camera_frames(np.arange(frames), 0.0, fps / scenario.fps)
-    times = np.arange(number[-1] + 1) / fps
-    size = settings.image_size_px or scenario.rig.image_size_px
-    action = (crowd.action, crowd.action_times)
-    return MovingView(move_broadcast_camera(settings, times, *action, size, rng), fps, number)
 
 
 def _rng(seed: Seed) -> np.random.Generator:
