@@ -59,8 +59,10 @@ def read_archive(
     """Return float64, int64 and str arrays of an npz file that has these members and no others.
 
     Types, shapes and sizes are checked first; only the requested members are loaded, None = all.
-    InputError if the file is absent, truncated, too large or no npz, or has members that are
-    missing, unknown, or of another type or shape.
+
+    Raises:
+        InputError: the file is absent, truncated, too large or no npz, or has members that are
+            missing, unknown, or of another type or shape; the error names file and member.
     """
     if not path.is_file():
         raise wrong(str(path), "an npz file", "nothing", "Check the path.")
@@ -84,8 +86,9 @@ def wrong(
 def read_npz(path: Path, limit: int) -> dict[str, NDArray[np.generic]]:
     """Return all arrays of an npz file by name, unpacked together at most `limit` bytes.
 
-    InputError if the file is no npz, truncated or too large, or has Python objects or inconsistent
-    sizes.
+    Raises:
+        InputError: the file is no npz, truncated or too large, or has Python objects or
+            inconsistent sizes; the error names file and member.
     """
     with open_npz(path) as file:
         infos = [info for info in file.infolist() if info.filename.endswith(".npy")]

@@ -35,8 +35,10 @@ def write_c3d(
     in time. The residual of a joint is its standard deviation, the mean over the axes, in whole
     millimetres from 1; it is 0, which the format reserves for computed points, if no camera
     contributes, and -1 if the joint is missing. Events mark the clip's begin and end, and group
-    WORLDPOSE holds the notes, by parameter name. InputError if the clip has no or too many frames,
-    or a note is too long.
+    WORLDPOSE holds the notes, by parameter name.
+
+    Raises:
+        InputError: the clip has no or too many frames, or a note is too long.
     """
     # LONG_FRAMES is a number of single precision: 46 hours at 100 frames per second.
     max_frames = 1 << 24

@@ -68,9 +68,11 @@ def build_camera(
 ) -> CameraCalibration:
     """Return the camera record; a rounded matrix becomes the nearest rotation.
 
-    Rotation (3, 3) and translation [m] are those of x_cam = R x_world + t. InputError if the size
-    is not whole, a focal length is not positive, the matrix is no rotation, or the name is unfit
-    for a file.
+    Rotation (3, 3) and translation [m] are those of x_cam = R x_world + t.
+
+    Raises:
+        InputError: the size is not whole, a focal length is not positive, the matrix is no
+            rotation, or the name is unfit for a file.
     """
     distance_limit = 1e7  # maximum coordinate of a translation [m]
     size_limit = 1 << 16  # of an image [px]; OpenCV's own for most operations
@@ -128,7 +130,8 @@ def index_by_name(
 ) -> dict[str, CameraCalibration]:
     """Return the cameras by id, in file order, from pairs of place in the file and camera.
 
-    InputError if there is no camera, two cameras have one name, or no camera has a pose.
+    Raises:
+        InputError: there is no camera, two cameras have one name, or no camera has a pose.
     """
     by_name: dict[str, CameraCalibration] = {}
     for where, camera in cameras:
@@ -170,8 +173,11 @@ def read_calibration_toml(
 
     `left_out` receives cameras without a pose; None = all must have one. `sizes` are those of
     videos [px], for files whose size is no whole number: programs that do not know it write twice
-    the principal point. InputError if an entry is missing or invalid, the unit is another, or the
-    world of FreeMoCap's file is not that of the ground.
+    the principal point.
+
+    Raises:
+        InputError: an entry is missing or invalid, the unit is another, or the world
+            of FreeMoCap's file is not that of the ground; it names file and key.
     """
     content = read_toml(path)
     unit_m = toml_unit_m(path, content)
@@ -292,7 +298,8 @@ def tells_model(key: str) -> bool:
 def read_model(where: str, given: Mapping[str, Any]) -> tuple[bool, bool]:
     """Return whether a lens's entries say, under any usual name, a fisheye, or a word of one order.
 
-    InputError if one names another lens model than those of OpenCV, or two contradict.
+    Raises:
+        InputError: one names another lens model than those of OpenCV, or two contradict.
     """
     # Names of lens models, and parts of them, which names of devices do not have.
     lens_part = r"fish|omnidir|equidist|equisolid|kannala|(?<!a)spher|division|polynom|radial"
@@ -362,7 +369,9 @@ def read_camera_table(
 
     The translation is in `unit_m` [m]. `axes` (3, 3) is the rotation A from the world of the file
     to one with z up, x' = A x. `where_pose` is the place of the pose, if it is in another file.
-    InputError if an entry is missing, misshapen, infinite or impossible.
+
+    Raises:
+        InputError: an entry is missing, misshapen, infinite or impossible.
     """
     optics = read_optics(where, table, keys)
     where_pose = where if where_pose is None else where_pose

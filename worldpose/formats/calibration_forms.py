@@ -95,8 +95,11 @@ def read_calibration(
 
     `sizes` may be missing in the file, such as those of the videos. `left_out` receives cameras
     without a pose, with the reason; None = all must have one. With `any_unit`, cameras may be as
-    far apart as in another unit than the form's. InputError, with file and key, for an unknown
-    form, a folder with no calibration or several, or an invalid entry.
+    far apart as in another unit than the form's.
+
+    Raises:
+        InputError: an unknown form, a folder with no calibration or several, or an invalid entry,
+            with file and key.
     """
     form, files = find_calibration(path) if path.is_dir() else _form_of(path)
     cameras = form.read(files, sizes, left_out)

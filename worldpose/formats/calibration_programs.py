@@ -182,8 +182,10 @@ def read_openpose_cameras(
     """Return the cameras of OpenPose's files `<camera>.xml`, in the world of the first one [m].
 
     `CameraMatrix` (3, 4) is [R | t], `Intrinsics` (3, 3), `Distortion` has OpenCV's coefficients;
-    the files lack the sizes of images [px]. InputError if an entry is missing or invalid, or the
-    size is not known.
+    the files lack the sizes of images [px].
+
+    Raises:
+        InputError: an entry is missing or invalid, or the size is not known.
     """
     cameras = []
     for file in files:

@@ -41,9 +41,12 @@ def read_calibration_xml(
 
     The root element tells the system: `calibration`, `Cameras` or `calibrationProfile`. Parameters
     that Qualisys' server states (`QTM_Parameters_Ver_...`) contain the first. `left_out` receives
-    cameras that are not calibrated; None = all must be. InputError if the file is unreadable, of
-    another program, or has a missing attribute, no finite number, no rotation, a lens that OpenCV's
-    model does not describe, no camera, or two cameras of one name.
+    cameras that are not calibrated; None = all must be.
+
+    Raises:
+        InputError: the file is unreadable, of another program, or has a missing attribute, no
+            finite number, no rotation, a lens that OpenCV's model does not describe, no camera, or
+            two cameras of one name; the error names file, camera and attribute.
     """
     require_file(path, 16 * SETTINGS_BYTES)
     try:
@@ -282,8 +285,11 @@ def _vicon_optics(
     center of distortion is scaled by 1 + w1 d^2 + w2 d^4 + w3 d^6 [px]. `VICON_RADIAL2` is
     "Vicon3Parameter" with that center and w1, w2, w3; `VICON_RADIAL` is w1, w2, about the principal
     point. OpenCV's model goes the other way, on the plane at distance 1. (Pose2Sim's reader takes
-    w1 and w2 as k1 and k2, which removes the distortion.) InputError for another model, one that
-    folds the image, or one that OpenCV's coefficients do not follow within `LENS_ERROR_PX`.
+    w1 and w2 as k1 and k2, which removes the distortion.)
+
+    Raises:
+        InputError: another model, one that folds the image, or one that OpenCV's coefficients do
+            not follow within `LENS_ERROR_PX`.
     """
     text = frame.get("VICON_RADIAL2")
     if text is not None:

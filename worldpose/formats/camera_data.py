@@ -69,9 +69,11 @@ def read_camera_data(
 
     `fps` is the video's, for time codes and the times of captures; `size` is that of the image
     [px], for fields of view; `first` is the video's number of the first row, None = the table's,
-    else 0; `number` is FreeD's number of the camera, -1 = there is only one. InputError, with
-    packet or row, for another form, a wrong checksum, a missing or unknown column, no number,
-    frames that do not rise, or a value out of bounds.
+    else 0; `number` is FreeD's number of the camera, -1 = there is only one.
+
+    Raises:
+        InputError: another form, a wrong checksum, a missing or unknown column, no number, frames
+            that do not rise, or a value out of bounds; the error names packet or row.
     """
     content = b""
     if path.is_file() and path.stat().st_size <= _BYTES:
@@ -297,7 +299,8 @@ def _is_fine(time: Floats) -> bool:
 def _time_frames(path: Path, columns: dict[str, Floats], fps: float) -> tuple[Integers, str]:
     """Return the rows that count by the time of a table, with `frame` of them; and a sentence.
 
-    InputError if times do not rise, are in no seconds, or contradict the frames.
+    Raises:
+        InputError: times do not rise, are in no seconds, or contradict the frames.
     """
     time, are_seconds = columns["time"], _is_fine(columns["time"])
     if "frame" in columns:
@@ -384,7 +387,9 @@ def apply_zoom_table(data: CameraData, path: Path, size: tuple[int, int]) -> Cam
     """Return camera data with the focal lengths of their zoom counts, linear between the rows.
 
     The table of the lens has a column zoom, and one of the focal length or field of view.
-    InputError if the table is invalid, or its focal length does not only rise or only fall.
+
+    Raises:
+        InputError: the table is invalid, or its focal length does not only rise or only fall.
     """
     columns, _, _ = _read_columns(path, ("zoom",))
     order = np.argsort(columns["zoom"])

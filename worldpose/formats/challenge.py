@@ -224,7 +224,9 @@ def write_pitch_points(path: Path, points: Floats) -> None:
 def read_challenge(folder: Path, only: str | None = None) -> dict[str, ChallengeClip]:
     """Read the clips of a challenge folder of either edition by name, or `only` the requested one.
 
-    InputError if the file is absent, has wrong types or shapes, or kinds that disagree.
+    Raises:
+        InputError: the file is absent, has wrong types or shapes, or kinds that disagree; the error
+            names file and place.
     """
     kinds: dict[str, dict[str, Floats]] = {}
     for kind in KINDS:
@@ -282,7 +284,9 @@ def read_submission(path: Path, only: Collection[str] | None = None) -> dict[str
 
     It is an npz, zipped or bare, or a table as of 2025, with a row for each joint of sequence,
     frame, person, joint, x, y, z. A table's last persons and frames are those with a joint.
-    InputError if there is no such file, no submission in it, or arrays of another type or shape.
+
+    Raises:
+        InputError: there is no such file, no submission in it, or arrays of another type or shape.
     """
     if path.suffix.lower() == PARQUET:
         return _read_table(path, only)

@@ -53,9 +53,12 @@ _NUMBER_TODO: Final = (
 def read_coco_results(path: Path) -> PeopleFile:
     """Return the people of a results file by rising frame, without frames that have no people.
 
-    The function reads in batches: the arrays bound the memory, not Python objects. InputError if
-    the file is unreadable, or has points of an unknown set, a confidence of another scale, no frame
-    number, or too many people per frame.
+    The function reads in batches: the arrays bound the memory, not Python objects.
+
+    Raises:
+        InputError: the file is unreadable, or has points of an unknown set, a confidence of another
+            scale, no frame number, or too many people per frame; the error names file, result and
+            point.
     """
     json_bytes = 1 << 30  # two million people; npz holds more and is faster
     keep = ("images", "meta_info")

@@ -36,9 +36,11 @@ def read_openpose_folder(folder: Path, model: str | None = None) -> PeopleFile:
     """Return the people of one camera's JSON files; `keypoint_sets` tells their points.
 
     `frame_numbers` finds the frame in a file's name. An empty file is a frame without people.
-    `model` is Pose2Sim's name of the pose model, if it is known. InputError if there are no frames,
-    two files for the same frame, no JSON of OpenPose, or an unknown or a changing number of
-    keypoints.
+    `model` is Pose2Sim's name of the pose model, if it is known.
+
+    Raises:
+        InputError: there are no frames, two files for the same frame, no JSON of OpenPose, or an
+            unknown or a changing number of keypoints; the error names file and key.
     """
     files = frame_files(folder)
     read = {frame: _read_frame(files[frame]) for frame in sorted(files)}
@@ -146,13 +148,15 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
 
     A line is frame, id, left, top, width, height, and up to four more numbers: confidence (-1 is
     taken as 1, and a box of confidence 0 is not counted, as in MOTChallenge's truth) and the class,
-    of which 1 is a person and -1 is not known; of 8 or 10 numbers, 0 is one if no box has these. Of
-    10 numbers it may be VisDrone's, which has persons of class 1 and 2, or a place in the world.
+    of which 1 is a person and -1 is not known; of 8 or 10 numbers, 0 is one if no box has these.
+    Of 10 numbers it may be VisDrone's, which has persons of class 1 and 2, or a place in the world.
     Frames begin at 1, and (1, 1) is the upper left corner of the image. Trackers follow people out
     of the image: such boxes are left out. Size [px] and number of frames are those of the video.
-    InputError, with the line, if the file is unreadable or empty, a line has no such numbers, a
-    frame that the video lacks, an id twice in a frame, an empty box, an impossible confidence, or
-    most boxes are outside of the image.
+
+    Raises:
+        InputError: the file is unreadable or empty, a line has no such numbers, a frame that the
+            video lacks, an id twice in a frame, an empty box, an impossible confidence, or most
+            boxes are outside of the image; the error names the line.
     """
     if file.suffix.lower() == ".npy":
         return _read_identified(file, frames)

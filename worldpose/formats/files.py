@@ -103,8 +103,10 @@ XML, of which annotations and calibrations have five."""
 def read_yaml(path: Path) -> Any:  # noqa: ANN401
     """Return the only document of a YAML file, as plain values, without aliases or repeated keys.
 
-    Dates stay text, so that `match_id: 2024-05-01` is a name. InputError for no such file, one that
-    is too large, no YAML or nested too deep, an alias or a repeated key.
+    Dates stay text, so that `match_id: 2024-05-01` is a name.
+
+    Raises:
+        InputError: no such file, too large, not YAML, nested too deep, an alias or a repeated key.
     """
     return parse_yaml(str(path), read_text(path, SETTINGS_BYTES))
 

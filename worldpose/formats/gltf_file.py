@@ -165,7 +165,10 @@ def write_gltf(
 
     `people` have the same frames, of which 0 is at 0 s; `markings` are lines (points, 3) [m],
     world; `notes` are the file's `extras`, and `licence` its copyright; `surface` writes that of
-    bodies, not only their joints. InputError if no person has a body.
+    bodies, not only their joints.
+
+    Raises:
+        InputError: no person has a body.
     """
     file = _File()
     writer = _Writer(file, model, fps, surface=surface)

@@ -56,8 +56,9 @@ class ExtraTracks:
 class JointTracks:
     """3D joints of several people over time, estimated or true.
 
-    InputError if shapes disagree, frames do not ascend, an id is repeated, a value is infinite, or
-    a joint has some but not all of its coordinates.
+    Raises:
+        InputError: shapes disagree, frames do not ascend, a duplicate id, a value is infinite, or a
+            joint has some but not all of its coordinates.
     """
 
     frames: NDArray[np.int64]
@@ -263,8 +264,9 @@ def write_joints(path: str | os.PathLike[str], tracks: JointTracks) -> None:
 def read_joints(path: str | os.PathLike[str]) -> JointTracks:
     """Read the tracks of a joints file.
 
-    InputError if the file is absent or truncated, or has missing or unknown members, wrong shapes
-    or infinite values.
+    Raises:
+        InputError: the file is absent or truncated, or has missing or unknown members, wrong shapes
+            or infinite values; the error names file and place.
     """
     arrays: dict[str, Any] = dict(read_archive(Path(path), MEMBERS))
     points = {name: arrays.pop(name, None) for name in EXTRA_MEMBERS}
@@ -319,8 +321,9 @@ def write_poses(path: Path, poses: BodyParameters, body_model: str) -> None:
 def read_poses(path: Path) -> tuple[BodyParameters, str | None]:
     """Read poses (persons, frames), with singular or plural names, and their body model if stated.
 
-    InputError if the file is absent or truncated, or has missing or unknown members or wrong
-    shapes.
+    Raises:
+        InputError: the file is absent or truncated, or has missing or unknown members or wrong
+            shapes; the error names file and member.
     """
     errors: list[InputError] = []
     for renamed in ({}, PLURALS):

@@ -70,9 +70,12 @@ def write_keypoint_arrays(path: Path, people: KeypointDetections) -> None:
 def read_keypoint_arrays(path: Path) -> KeypointDetections:
     """Return the people of an npz file as stored; frames rise, possibly with gaps.
 
-    The function checks every declared type, shape and size before it unpacks data. InputError if
-    the file is truncated, too large or no npz, has another type, shape or byte order, frames that
-    do not rise, infinite values, or a keypoint without confidence.
+    The function checks every declared type, shape and size before it unpacks data.
+
+    Raises:
+        InputError: the file is truncated, too large or no npz, has another type, shape or byte
+            order, frames that do not rise, infinite values, or a keypoint without confidence; the
+            error names file and member.
     """
     points_limit = 1000  # maximum number of these points
     require_file(path)
@@ -190,8 +193,10 @@ def select_ranges(
     """Return the people of `path`, dense over ranges of the camera's own frames.
 
     Ranges, first frame and number of frames, are rising and disjoint. Frames outside are left out;
-    frames that the file lacks have no people. InputError if all people are outside the wanted
-    frames, or these are too many.
+    frames that the file lacks have no people.
+
+    Raises:
+        InputError: all people are outside the wanted frames, or these are too many.
     """
     seen = people.frame
     if len(seen) and not any(((seen >= first) & (seen < first + n)).any() for first, n in ranges):

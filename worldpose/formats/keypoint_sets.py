@@ -167,8 +167,10 @@ the simulation miss by 0.03 to 0.15, wrong ones by 0.5 or more."""
 def order_by_names(where: str, names: Sequence[str]) -> PointOrder:
     """Return the order of points whose names a file gives, in any usual spelling.
 
-    A set may lack joints of the face. InputError if another joint of COCO-17 is missing, or two
-    names are the same.
+    A set may lack joints of the face.
+
+    Raises:
+        InputError: another joint of COCO-17 is missing, or two names are the same.
     """
     plain = [_plain(str(name)) for name in names]
     if "left_ankle" not in plain:  # Human3.6M calls them feet
@@ -208,8 +210,11 @@ def order_by_points(where: str, points: AnyFloats, stated: str | None = None) ->
     """Return the order of points whose number alone is known, and perhaps a model of `MODELS`.
 
     `points` (people, points, 3) are x, y [px] and confidence, 0 = missing. A stated model counts if
-    it has this number of points. InputError if no set has this number of points, or their lengths
-    are those of another set or of none.
+    it has this number of points.
+
+    Raises:
+        InputError: no set has this number of points, or their lengths are those of another set or
+            of none.
     """
     plausible = 0.3  # largest misfit of the order that explains them [log]
     # Least misfit of people, as many as these, that no view explains [log]: seen from right above,
@@ -371,8 +376,10 @@ def people_by_frame(
 
     Of n entries: `frames` (n,); `points` (n, 17 or 23, 3) COCO-17 and perhaps `FEET`, confidence 0
     = missing; `boxes` (n, 4) x, y, width, height [px], NaN = that of the joints; `scores` (n,), NaN
-    = the mean confidence of the joints. Arrays have at most `limit` bytes. InputError for too many
-    people in a frame, or arrays that are too large.
+    = the mean confidence of the joints. Arrays have at most `limit` bytes.
+
+    Raises:
+        InputError: too many people in a frame, or arrays that are too large.
     """
     found: Flags = np.asarray(points[..., 2] > 0)
     if found.sum() >= len(COCO17) and float(np.abs(points[found, :2]).max()) < 2.0:

@@ -68,9 +68,12 @@ def read_lenses(
     or JSON file, TOML without tables, an npz file, or two npy files, one of them the 3 x 3 matrix.
     Kalibr's YAML, and JSON of multical and Panoptic Studio, name their cameras too. `camera` is
     that of a file that names none. A lens of a file with another size than `sizes`, those of each
-    camera's images [px], and the same shape of image is scaled. InputError if a file is unreadable,
-    of another kind, without matrix or distortion; the pixels are not square; the lens folds within
-    the image; the image sizes do not fit; a camera is unknown or not named.
+    camera's images [px], and the same shape of image is scaled.
+
+    Raises:
+        InputError: a file is unreadable, of another kind, without matrix or distortion; the pixels
+            are not square; the lens folds within the image; the image sizes do not fit; a camera is
+            unknown or not named.
     """
     first = files[0]
     if first.suffix.lower() == ".toml":
@@ -206,7 +209,10 @@ def _read_file(file: Path) -> dict[str, Any]:
 def read_opencap(file: Path) -> dict[str, Any]:
     """Return the entries of OpenCap's pickle of one camera, of which nothing is run.
 
-    Its image size has the height first; here the width is first. InputError if the file is none.
+    Its image size has the height first; here the width is first.
+
+    Raises:
+        InputError: the file is none.
     """
     from worldpose.pickles import read_pickle  # late: it imports scipy
 
@@ -268,8 +274,9 @@ def kalibr_tables(
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the name of each camera of a camchain, and its table in Anipose's form, perhaps posed.
 
-    InputError if the content is no camchain, or a camera has another model than the pinhole with
-    `radtan`, `equidistant` or no distortion.
+    Raises:
+        InputError: the content is no camchain, or a camera has another model than the pinhole with
+            `radtan`, `equidistant` or no distortion.
     """
     if not isinstance(content, dict) or not is_kalibr(content):
         expected = "a camchain of Kalibr, or EasyMocap's intri.yml and extri.yml"
@@ -326,8 +333,10 @@ def _chain(
 def _read_mapping(file: Path) -> dict[str, Any]:
     """Return numbers, arrays and texts of plain JSON, YAML or TOML, as of ROS's camera_calibration.
 
-    A matrix is a list of rows, or a mapping with `rows`, `cols` and `data`. InputError if the file
-    is no mapping, or a matrix has other sizes than it says.
+    A matrix is a list of rows, or a mapping with `rows`, `cols` and `data`.
+
+    Raises:
+        InputError: the file is no mapping, or a matrix has other sizes than it says.
     """
     suffix = file.suffix.lower()
     content: Any = read_toml(file) if suffix == ".toml" else None

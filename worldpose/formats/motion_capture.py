@@ -222,8 +222,10 @@ def write_motion(path: Path, model: BodyModel, poses: BodyParameters, fps: float
     The skeleton has the model's 24 joints in T-pose, with the bone lengths of the first frame's
     betas; leaf joints end in half of their bone, only for display. The root has position and
     rotation, every other joint its rotation relative to its parent; angles are in degrees and apply
-    in the order z, x, y of the file's axes. Lengths are centimetres and y is up. InputError if
-    there are no frames, or a parameter is missing.
+    in the order z, x, y of the file's axes. Lengths are centimetres and y is up.
+
+    Raises:
+        InputError: there are no frames, or a parameter is missing.
     """
     centimetres = 100.0  # in a metre: animation tools take numbers of BVH for them
     angles = np.concatenate([poses.global_orient, poses.body_pose], axis=-1)
@@ -370,8 +372,10 @@ def write_opensim_motion(
 ) -> None:
     """Write `opensim_coordinates` (frames, 27) [deg, m] at times (frames,) [s] as a .mot file.
 
-    The file is written whole or not at all; notes are lines of its header. InputError if there are
-    no frames, or a value is missing.
+    The file is written whole or not at all; notes are lines of its header.
+
+    Raises:
+        InputError: there are no frames, or a value is missing.
     """
     mot_decimals = 5  # decimals of degrees, metres and seconds
     if not len(coordinates) or not np.isfinite(coordinates).all():

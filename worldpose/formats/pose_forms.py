@@ -19,7 +19,8 @@ from worldpose.errors import InputError
 def plain_entries(where: str, items: Iterable[Any]) -> Iterator[Any]:
     """Yield entries of COCO results as they are, those of other forms with frames as image ids.
 
-    InputError if MMPose's first frame is neither 0 nor 1, or an entry has no frame.
+    Raises:
+        InputError: MMPose's first frame is neither 0 nor 1, or an entry has no frame.
     """
     first: int | None = None
     for index, item in enumerate(items):

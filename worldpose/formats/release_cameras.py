@@ -69,8 +69,12 @@ def read_camera(path: Path, image_size: tuple[int, int] | None = None) -> Camera
 
     The batch is NaN where a frame has no camera. The image size [px] is by default that of a
     released camera, or of an image about the principal point where that is off alike along both
-    axes. InputError if the file is absent, has missing or unknown members, wrong shapes or no rows,
-    a K with skew or without focal length, or an R that is not a rotation.
+    axes.
+
+    Raises:
+        InputError: the file is absent, has missing or unknown members, wrong shapes or no rows, a K
+            with skew or without focal length, or an R that is not a rotation; the error names file
+            and place.
     """
     arrays = read_archive(path, MEMBERS)
     k, rotation = arrays["K"], arrays["R"].copy()
@@ -151,9 +155,11 @@ class CameraRows:
 def read_kit_camera(path: Path, image_size: tuple[int, int]) -> Camera:
     """Return the camera (frames,) of a challenge's file, whose pose is NaN where it has none.
 
-    The file has K and k of every frame, R and t of every frame or of the first alone. InputError as
-    `read_camera`, and for another number of poses, unequal focal lengths of the two axes, or
-    distortion beyond k1 and k2.
+    The file has K and k of every frame, R and t of every frame or of the first alone.
+
+    Raises:
+        InputError: as `read_camera`; or another number of poses, unequal focal lengths of the two
+            axes, or distortion beyond k1 and k2.
     """
     arrays = read_archive(path, _ROW_MEMBERS)
     intrinsics, distortion, poses = arrays["K"], arrays["k"], len(arrays["R"])

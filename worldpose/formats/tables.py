@@ -300,7 +300,9 @@ def write_parquet(path: Path, table: pd.DataFrame, notes: Mapping[str, str]) -> 
 def read_parquet(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Return columns of a Parquet file by name.
 
-    InputError if the file is unreadable or lacks a column; UsageError if pyarrow is not installed.
+    Raises:
+        InputError: the file is unreadable or lacks a column.
+        UsageError: pyarrow is not installed.
     """
     pa, parquet = _import_pyarrow(str(path), "give an npz file")
     try:

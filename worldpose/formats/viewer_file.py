@@ -262,8 +262,10 @@ def write_viewer(
 ) -> None:
     """Write the viewer's built page with clips and their mp4 files inside, whole or not at all.
 
-    It opens from disk without a network. InputError if nobody is in the clips, or the file would be
-    too large.
+    It opens from disk without a network.
+
+    Raises:
+        InputError: nobody is in the clips, or the file would be too large.
     """
     if not any(clip.has_people for clip in clips):
         expected = "a person with joints, a body or a place on the pitch"

@@ -41,8 +41,10 @@ def read_clicked(
 ) -> dict[str, ClickedMarkings]:
     """Return the clicks of the static cameras of a match folder, in their order.
 
-    `whose` is the pitch in words, for messages; None = names are not checked. InputError if a file
-    belongs to no static camera, or is invalid.
+    `whose` is the pitch in words, for messages; None = names are not checked.
+
+    Raises:
+        InputError: a file belongs to no static camera, or is invalid.
     """
     static = {camera.id: camera for camera in spec.static_cameras}
     clicked = {}
@@ -58,8 +60,10 @@ def read_clicked_markings(
 ) -> ClickedMarkings:
     """Return the clicks in one camera's image, a JSON of `ClickedMarkings`; see `read_clicked`.
 
-    InputError if the file is not JSON, or has an unknown key or name, no number, a repeated name, a
-    pixel outside the image, or no clicks, or the match has no pitch.
+    Raises:
+        InputError: the file is not JSON, or has an unknown key or name, no number, a repeated name,
+            a pixel outside the image, or no clicks, or the match has no pitch; the error names file
+            and entry.
     """
     template = _template(file, pitch, whose)
     clicked = validate_record(ClickedMarkings, read_json(file), str(file))
@@ -72,7 +76,8 @@ def read_key_frames(
 ) -> dict[str, KeyFrames]:
     """Return the clicked key frames by broadcast view, in their order; see `read_clicked`.
 
-    InputError if a file belongs to no clip with a broadcast camera, or is invalid.
+    Raises:
+        InputError: a file belongs to no clip with a broadcast camera, or is invalid.
     """
     views, picked = spec.broadcast_views, {}
     of_clips = f"<clip>.json of {BROADCAST_FILES}"

@@ -40,8 +40,10 @@ def import_camera_data(
 
     `view` is None for the only broadcast view, `first` the number in its video of the file's first
     frame, None = as the file says, `number` FreeD's number of the camera, None = the only one.
-    InputError if a file is invalid or has no frame of the view, or the view has camera data
-    already.
+
+    Raises:
+        InputError: a file is invalid or has no frame of the view, or the view has camera data
+            already.
     """
     match = read_match(folder, whose=None)
     views = match.spec.broadcast_views

@@ -34,8 +34,10 @@ def find_videos(
     A camera is called as its file or folder. Chapters of one recording are in the folder, or in a
     folder of the camera, as may be its only video, unless a file beside that folder has its name.
     Chapters are joined to one file in `workshop`; None = they are refused. With `named`, each file
-    of the folder is the video of a camera, even if it is named as a chapter. InputError if two
-    videos have one name, or chapters are not to be joined.
+    of the folder is the video of a camera, even if it is named as a chapter.
+
+    Raises:
+        InputError: two videos have one name, or chapters are not to be joined.
     """
     there = sorted(folder.glob("[!.]*"))
     videos = [file for file in there if is_video(file)]
@@ -250,9 +252,11 @@ def fit_to_video(
 
     A change is added to the notes. With `of_sensor` (`is_of_sensor`), a smaller video is the middle
     part of the sensor, as in Vicon's video modes; `has_poses` tells whether 2D poses can contradict
-    that where a resized video has the same shape. InputError if the video is neither what was
-    calibrated nor the same picture resized, or perhaps both the middle part of it and the same
-    picture resized.
+    that where a resized video has the same shape.
+
+    Raises:
+        InputError: the video is neither what was calibrated nor the same picture resized, or
+            perhaps both the middle part of it and the same picture resized.
     """
     same_shape = 0.002  # largest relative difference of shapes [1]: sides are whole pixels
     if index.size == camera.image_size:

@@ -68,11 +68,13 @@ def import_challenge(
 
     The kit has `cameras/<sequence>.npz` (K and k of every frame, R and t of the first or of every
     one), `boxes/<sequence>.npy`, `videos/<sequence>.mp4` or `images/<sequence>/`,
-    `pitch_points.txt`, and possibly `skel_2d/` and `skel_3d/`. Boxes and skeletons have one row per
-    person. The boxes become tracks with the row as id, 2D skeletons become keypoints, and 3D
+    `pitch_points.txt`, and possibly `skel_2d/` and `skel_3d/`. Boxes and skeletons have one row
+    per person. The boxes become tracks with the row as id, 2D skeletons become keypoints, and 3D
     skeletons become monocular poses by `lift`. `fps` is by default that of the videos; images have
-    none. InputError if a file is missing, invalid, or contradicts another one; nothing is written
-    then.
+    none.
+
+    Raises:
+        InputError: a file is missing, invalid, or contradicts another one. Nothing is written.
     """
     pitch = _read_pitch(kit / "pitch_points.txt")
     cameras = sorted((kit / "cameras").glob("[!.]*.npz"))

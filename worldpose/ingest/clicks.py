@@ -96,9 +96,11 @@ def import_clicks(
 
     `owner` is the static camera, or the broadcast view whose key frames are numbered by the images'
     names; None: the images are named after cameras. `pitch` is by default the folder's or the
-    standard one. InputError if the file has another form; a label is unknown; an image belongs to
-    no camera, or has another size; clicks exist already; or places depend on a venue's unknown
-    pitch.
+    standard one.
+
+    Raises:
+        InputError: the file has another form; a label is unknown; an image belongs to no camera, or
+            has another size; clicks exist already; or places depend on a venue's unknown pitch.
     """
     spec = read_spec(folder)
     is_unknown = pitch is None and spec.venue is not None and pitch_file(folder, spec) is None

@@ -26,8 +26,10 @@ from worldpose.errors import InputError
 def row_rate(where: str, fps: float, frame: Integers | None = None) -> float:
     """Return the rows per second of rows with these frame numbers (n,), `fps` numbers a second.
 
-    Without numbers, a row is a frame. InputError if `fps` is no positive number, or the frames do
-    not rise in equal steps.
+    Without numbers, a row is a frame.
+
+    Raises:
+        InputError: `fps` is no positive number, or the frames do not rise in equal steps.
     """
     if not isinstance(fps, int | float | np.number) or not 0.0 < fps < np.inf:
         todo = "Give the frame rate of the recording, such as 25.0."

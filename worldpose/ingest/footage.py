@@ -111,8 +111,10 @@ def read_unit(
 ) -> tuple[KeypointDetections, CameraCalibration | None]:
     """Return detections and given calibration of a static camera or a broadcast view.
 
-    `frame` of the detections are match frames. InputError if the match has no such unit, or no or
-    invalid detections of it.
+    `frame` of the detections are match frames.
+
+    Raises:
+        InputError: the match has no such unit, or no or invalid detections for it.
     """
     if unit_id not in match.detections:
         expected = f"2D poses of {unit_id!r} ({unit_id}.json or {unit_id}.npz)"
@@ -163,8 +165,10 @@ def read_footage(
     """Return a video's synchronization with the match's clock, decoding only its first frame.
 
     Frame rate and image size (width, height) [px] are those of match.yaml, `clips` id, first match
-    frame and number of frames of each; without an index it is read from the video. InputError for
-    no video, another size or rate, or no frame of any clip.
+    frame and number of frames of each; without an index it is read from the video.
+
+    Raises:
+        InputError: no video, another size or rate, or no frame of any clip.
     """
     from worldpose.video.folder import index_video  # late: most commands open no video
 
@@ -246,7 +250,8 @@ def stretches(numbers: NDArray[np.int64]) -> list[list[int]]:
 def read_still(path: str | os.PathLike[str], image_size: tuple[int, int]) -> NDArray[np.uint8]:
     """Return the image (height, width, 3), RGB, of a PNG, JPEG, TIFF, BMP or WebP file.
 
-    InputError for no such file, no image, or another size than the camera's [px].
+    Raises:
+        InputError: no such file, no image, or not the camera's image size [px].
     """
     still_bytes = 1 << 28  # maximum size of a still [byte]; a noisy 4K image has 25 MB
     from worldpose.video.folder import MAX_PIXELS, declared_size, decode_image  # late: as above

@@ -202,10 +202,12 @@ def import_lenses(
 ) -> dict[str, LensCalibration]:
     """Write lenses without a pose into a match folder's lenses.toml, and return them.
 
-    Static calibration takes them as prior of focal length, principal point and distortion; the pose
-    comes from clicks. `camera` is the static camera of a file that names none. InputError if a file
-    is invalid (`read_lenses`), its camera is unknown or has a lens already, or calibration.toml
-    gives it with its pose.
+    Static calibration takes them as prior of focal length, principal point and distortion; the
+    pose comes from clicks. `camera` is the static camera of a file that names none.
+
+    Raises:
+        InputError: a file is invalid (`read_lenses`), its camera is unknown or has a lens already,
+            or calibration.toml gives it with its pose.
     """
     spec = read_spec(folder)
     sizes = image_sizes(spec)
@@ -235,8 +237,10 @@ def pick_cameras(
     """Return the file of each camera that has one, of those `found` in a folder by camera.
 
     Files of cameras that are left out are ignored; cameras without a file are added to these, and a
-    sentence about files without a camera. `calibration` and `suffixes` are for messages. InputError
-    if fewer than two cameras have a file, or than all of fewer cameras.
+    sentence about files without a camera. `calibration` and `suffixes` are for messages.
+
+    Raises:
+        InputError: fewer than two cameras have a file, or than all of fewer cameras.
     """
     files = {name: file for name, file in found.items() if name not in left_out}
     both = [name for name in cameras if name in files]

@@ -132,10 +132,12 @@ def read_match(
     Videos of the paths `known` may be gone, as their results are at hand. `pitch` is that of the
     settings, whose names clicks have; None = the folder's or the standard one. Of a venue of
     match.yaml without pitch.json, names are checked with `pitch` alone. `whose` is that pitch in
-    words, for messages; None = the names of clicks are not checked. InputError if the folder is
-    unreadable (its disk is not mounted, or this user has no permission); a file or key is missing,
-    unknown, contradicts another or leads out of the folder; a static camera has neither video nor
-    detections.
+    words, for messages; None = the names of clicks are not checked.
+
+    Raises:
+        InputError: the folder is unreadable (its disk is not mounted, or this user has no
+            permission); a file or key is missing, unknown, contradicts another or leads out of the
+            folder; a static camera has neither video nor detections.
     """
     folder = Path(folder)
     with reachable(folder):
@@ -200,8 +202,10 @@ def spec_around(path: Path) -> tuple[Path, MatchSpec] | None:
 def require_calibrated(match: MatchFolder) -> None:
     """Raise InputError for a match with a static camera that has to be clicked.
 
-    A match without static cameras needs clicked key frames, in one clip at least. The error names
-    the missing cameras and the required files.
+    A match without static cameras needs clicked key frames, in one clip at least.
+
+    Raises:
+        InputError: the error names the missing cameras and the required files.
     """
     if not match.spec.static_cameras:
         _require_key_frames(match)

@@ -25,8 +25,9 @@ NO_PITCH: Final = "none"
 def pitch_file(folder: Path, spec: MatchSpec) -> Path | None:
     """Return the file of the surveyed pitch; None = no pitch, or the standard one.
 
-    InputError if match.yaml names a pitch file that is missing or outside, or has `pitch: none`
-    although pitch.json exists.
+    Raises:
+        InputError: match.yaml names a pitch file that is missing or outside, or has `pitch: none`
+            although pitch.json exists.
     """
     if spec.pitch == NO_PITCH:
         if (folder / "pitch.json").exists():

@@ -70,8 +70,11 @@ def import_pose2sim(
     clock of a camera's video. `frame_rate` and `frame_range` of Config.toml hold. Where a video is
     smaller or larger than the calibrated images, with or without black bars, its camera is in the
     video's pixels, as the 2D poses are. `fps` is by default from Config.toml or the videos; other
-    arguments and the result are as in `import_match`. InputError if something is absent, invalid or
-    contradicts the rest; nothing is written then.
+    arguments and the result are as in `import_match`.
+
+    Raises:
+        InputError: something is absent, invalid or contradicts the rest; nothing is written then,
+            and the error names file and key.
     """
     settings, config = _read_pose2sim_settings(project)
     calibration = _find_pose2sim_calibration(project)

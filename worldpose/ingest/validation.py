@@ -25,8 +25,9 @@ R = TypeVar("R", bound=Record)
 def validate_record(model: type[R], data: object, file: str) -> R:
     """Return the record in plain data from `file`, without conversions or ignored keys.
 
-    InputError if a key is unknown or missing, or a value is invalid; a misspelt key takes
-    precedence over the key that is missing because of it.
+    Raises:
+        InputError: a key is unknown or missing, or a value is invalid; a misspelt key takes
+            precedence over the key that is missing because of it.
     """
     try:
         text = json.dumps(data)
@@ -163,7 +164,8 @@ def same_name(name: str) -> str:
 def existing_file(folder: Path, name: str, where: str, *, folders: bool = False) -> Path:
     """Return the path of an existing file in the folder, or of a folder that is not empty.
 
-    InputError if there is none, or it is outside; `where` is the source of the name.
+    Raises:
+        InputError: there is no such file, or it is outside; `where` is the source of the name.
     """
     require_local(name, where)
     try:
@@ -199,7 +201,10 @@ def files_by_unit(
 
     The subfolder need not exist. `suffixes` are endings in small letters; with `alone`, files with
     other endings are refused, not ignored. `units` are what the known units are, for messages.
-    InputError if a file belongs to no such unit, two belong to one, or it leads out of the folder.
+
+    Raises:
+        InputError: a file belongs to no such unit, or two belong to one; it leads out of the
+            folder.
     """
     found: dict[str, Path] = {}
     for file in sorted((folder / place).glob("[!.]*")):

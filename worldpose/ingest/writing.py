@@ -63,8 +63,11 @@ def write_match(
     files, not the match frame. The pitch goes to the file named by `spec.pitch`, else to
     pitch.json, a still (height, width, 3), RGB, to the camera's `still`, else to
     stills/<camera>.png. `further` is called with the temporary match folder, to add videos and
-    `reference/`. InputError if the folder exists and is not empty, its disk is full, or the
-    arguments contradict each other.
+    `reference/`.
+
+    Raises:
+        InputError: the folder exists and is not empty, its disk is full, or the arguments
+            contradict each other.
     """
     annotations = annotations or MatchAnnotations()
     clicked, key_frames = annotations.clicked, annotations.key_frames
@@ -213,8 +216,11 @@ def import_boxes(boxes: Path, folder: Path, notes: list[str] | None = None) -> d
     """Copy boxes of people into a match folder with videos; return their number by camera or clip.
 
     `boxes` has `<camera>.txt` or `<clip>.txt` (`read_boxes`); the notes receive sentences about
-    boxes that are left out or changed. InputError if a file is invalid, its camera has no video, or
-    has 2D poses or boxes already; nothing is written then.
+    boxes that are left out or changed.
+
+    Raises:
+        InputError: a file is invalid, its camera has no video, or has 2D poses or boxes already;
+            nothing is written then.
     """
     match = read_match(folder, whose=None)
     open_to = {name for name in match.videos if name not in match.detections}
@@ -240,8 +246,10 @@ def copy_boxes(
 ) -> dict[str, int]:
     """Check all files of boxes against the videos, then copy them; return their numbers.
 
-    `indices` are the frames of the video of each camera that may have boxes. InputError if there
-    are no files, one of an unknown camera, or an invalid one.
+    `indices` are the frames of the video of each camera that may have boxes.
+
+    Raises:
+        InputError: there are no files, one of an unknown camera, or an invalid one.
     """
     files = _box_files(boxes)
     stems = [file.stem for file in files]

@@ -30,8 +30,10 @@ def write_recording(
 
     In the image of each static camera, the markings are where its lens shows them.
 
-    Cameras are single, or one per frame of the tracks, NaN where missing. UsageError if rerun-sdk
-    is not installed.
+    Cameras are single, or one per frame of the tracks, NaN where missing.
+
+    Raises:
+        UsageError: rerun-sdk is not installed.
     """
     white = (235, 235, 235)
     try:

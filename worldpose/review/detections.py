@@ -156,8 +156,11 @@ def find_changes(
     An image that the annotator's file lacks counts as unchanged. Positions closer than a hundredth
     of a pixel count as equal, since annotation tools round. Exported images are named by
     `image_name`, their people have a `detection`; edited names can have a folder, or a prefix that
-    ends in `-`, before them. InputError for an image that was not exported or has another size, a
-    duplicate person, or an unknown detection index.
+    ends in `-`, before them.
+
+    Raises:
+        InputError: an image that was not exported or has another size, a duplicate person, or an
+            unknown detection index.
     """
     known = {PurePosixPath(picture.name).name: picture for picture in exported}
     edits: list[DetectionEdit] = []

@@ -323,8 +323,10 @@ def preview(
     """Return the camera from the current clicks, and the projected pitch.
 
     With the image (height, width, 3), the calibration refines the camera on the painted lines,
-    which takes seconds and not milliseconds. InputError if the clicks do not determine a camera;
-    the message says which clicks to add.
+    which takes seconds and not milliseconds.
+
+    Raises:
+        InputError: the clicks do not determine a camera; the message says which clicks to add.
     """
     found = calibrate_camera(
         drawing.template,

@@ -101,9 +101,11 @@ def read_journal(store: Store, match_id: str) -> Journal:
     ignores it and lists it in `damage`.
 
     The function caches per store object: if the last entry is unchanged, it reads only newer ones.
-    Only `verify` and the next process detect later damage to earlier entries. CorruptionError if an
-    entry with a successor is damaged or missing; InputError if an entry has another contract
-    version.
+    Only `verify` and the next process detect later damage to earlier entries.
+
+    Raises:
+        CorruptionError: an entry with a successor is damaged or missing.
+        InputError: an entry has another contract version.
     """
     folder = f"reviews/{checked_name(match_id)}"
     with _KNOWN_LOCK:

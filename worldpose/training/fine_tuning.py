@@ -107,8 +107,10 @@ def train(
 
     A check also runs before the first step: training that makes the net worse changes nothing,
     unless the settings keep the last weights. The checkpoint is written at every check; if the file
-    exists, training resumes from it. `progress` receives a line at every check. InputError if the
-    checkpoint is of another training.
+    exists, training resumes from it. `progress` receives a line at every check.
+
+    Raises:
+        InputError: the checkpoint is of another training.
     """
     net, settings = training.net, training.settings
     optimizer = torch.optim.AdamW(net.parameters(), lr=settings.rate, weight_decay=settings.decay)
@@ -341,8 +343,10 @@ def fine_tune(
     """Fine-tune a net on labels and return its metrics; the weights are written in any case.
 
     Images with reviewed labels are in the order of recording. A killed training resumes with the
-    checkpoint next to the weights. `start` are initial weights; None = the shipped ones. InputError
-    for too few frames, a subset without people, or weights of another net.
+    checkpoint next to the weights. `start` are initial weights; None = the shipped ones.
+
+    Raises:
+        InputError: too few frames, a subset without people, or weights of another net.
     """
     settings = settings or FineTuningSettings()
     learned, checked, held_out = split(pictures, settings, kind)

@@ -95,8 +95,11 @@ def read_labels(annotations: Path, pictures: Path | None = None) -> list[Labelle
     `iscrowd` 1 marks ignored people. Boxes are x, y, width, height in the pixels of the keypoints,
     which begin at the centre of the top-left pixel. The categories name the order of keypoints;
     annotations of categories without keypoints or a name of people are left out, and said. The
-    images are by default in the folder of the JSON file. InputError if the file is no COCO
-    keypoints data set, or an image lies outside of the folder or has another size.
+    images are by default in the folder of the JSON file.
+
+    Raises:
+        InputError: the file is no COCO keypoints data set, or an image lies outside of the folder
+            or has another size.
     """
     folder = annotations.parent if pictures is None else pictures
 
@@ -172,7 +175,8 @@ def _orders(
 ) -> Mapping[int | None, tuple[PointOrder, int]]:
     """Return order and number of keypoints by category of people; by None without categories.
 
-    InputError if none of several categories is of people, or its keypoints are others.
+    Raises:
+        InputError: none of several categories is of people, or its keypoints are others.
     """
     usual = order_by_names(str(path), COCO17), len(COCO17)
     people = [each for each in categories if each.is_of_people or len(categories) == 1]
@@ -281,8 +285,11 @@ def propose_labels(
 
     The folder then holds pictures/<video>_<frame>.png and labels.json, for any editor of COCO
     keypoints and for `read_labels`. The write is atomic: a failure leaves nothing that prevents a
-    retry. UsageError if the folder is not empty; InputError if two videos have the same name or
-    different sizes, or one is damaged.
+    retry.
+
+    Raises:
+        UsageError: the folder is not empty.
+        InputError: two videos have the same name or different sizes, or one is damaged.
     """
     if folder.exists() and any(folder.iterdir()):
         todo = "Choose another folder: corrected labels are never overwritten."

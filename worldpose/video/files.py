@@ -26,8 +26,10 @@ from worldpose.video.pictures import MAX_FRAME_PIXELS, FrameIndex, Pictures, con
 def open_file(path: Path, form: str | None = None) -> InputContainer:
     """Open a file whose frames decode only within `MAX_FRAME_PIXELS`, whatever its header says.
 
-    Threads keep one frame each, so that large frames get few of them. InputError if the file is a
-    list of other files, which can be outside of its folder.
+    Threads keep one frame each, so that large frames get few of them.
+
+    Raises:
+        InputError: the file is a list of other files, which can be outside of its folder.
     """
     limit = {"max_pixels": str(MAX_FRAME_PIXELS)}
     local = {"protocol_whitelist": "file"}
@@ -48,8 +50,10 @@ def open_file(path: Path, form: str | None = None) -> InputContainer:
 def index_frames(path: Path) -> FrameIndex:
     """Return the index of a file's first video stream, from its packets: it decodes one frame.
 
-    It decodes all frames of a file whose packets do not say when each frame is shown. InputError
-    for no video, frames without time stamps, or stamps that start again.
+    It decodes all frames of a file whose packets do not say when each frame is shown.
+
+    Raises:
+        InputError: no video, frames without time stamps, or stamps that start again.
     """
     try:
         with open_file(path) as container:
@@ -269,8 +273,10 @@ class VideoReader(Pictures):
 
         Frames after a damaged one up to the next key frame are None too: they may be predicted from
         it. RGB images get the width [px], before rotation. Frames that are not in `only` are
-        decoded, but not converted and yielded. InputError if there are no such frames, or one has
-        another size than the first.
+        decoded, but not converted and yielded.
+
+        Raises:
+            InputError: there are no such frames, or one has another size than the first.
         """
         stop = len(self) if stop is None else stop
         if not 0 <= start <= stop <= len(self):
@@ -396,8 +402,10 @@ def write_video(path: Path, pictures: Iterable[Image], fps: float, *, quality: i
 
     H.264 with a key frame per second if the installed FFmpeg can write it, else MPEG-4 part 2.
     Images are (height, width, 3) RGB, or (height, width) grey, all of one even size. Quality 0 is
-    without loss, 51 the worst (H.264's constant rate factor). InputError for no image, or one of
-    another or an odd size.
+    without loss, 51 the worst (H.264's constant rate factor).
+
+    Raises:
+        InputError: no image, or one of another or an odd size.
     """
     rate = Fraction(fps).limit_denominator(1001)
     codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"

@@ -104,7 +104,8 @@ class ImageFolder(Pictures):
 def numbered_images(folder: Path) -> list[tuple[int, Path]]:
     """Return the images of a folder by the number at the end of their names.
 
-    InputError for no images, or names without a number or with the same one.
+    Raises:
+        InputError: no images, or names without a number or with the same one.
     """
     digits = 18  # 64 bits hold no longer number
     files = sorted(
@@ -228,8 +229,10 @@ def median_picture(frames: Iterable[Image], most: int = 64) -> Image:
 
     At most `most` frames are in memory, evenly spread over the clip: when the limit is reached, the
     function drops every second frame and doubles the stride. Frames are (height, width) or (height,
-    width, 3), of one camera that does not move. InputError if there are no frames, their sizes
-    differ, or `most` is below two.
+    width, 3), of one camera that does not move.
+
+    Raises:
+        InputError: there are no frames, their sizes differ, or `most` is below two.
     """
     band = 64  # rows, which stay in the processor's cache
     if most < 2:

@@ -25,7 +25,8 @@ from worldpose.video.pictures import FrameIndex, convert_pixels
 def join_videos(parts: Sequence[Path], out: Path) -> None:
     """Write the chapters of one recording as one file, without re-encoding.
 
-    InputError for no video, chapters that differ, or a file that does not hold all frames.
+    Raises:
+        InputError: no video, chapters that differ, or a file that does not hold all frames.
     """
     indices = [index_frames(part) for part in parts]
     base = indices[0].time_base
@@ -61,8 +62,10 @@ def cut_video(path: Path, start: int, stop: int, out: Path) -> int:
 
     Decoding begins at key frames: the file also holds some frames before the first one wanted, and
     perhaps some after the last one, from which others are predicted. The function returns the
-    number of frame `start` in the new file. InputError for no video, or one that has no such
-    frames.
+    number of frame `start` in the new file.
+
+    Raises:
+        InputError: no video, or it has no such frames.
     """
     index = index_frames(path)
     if not 0 <= start < stop <= len(index):

@@ -37,7 +37,9 @@ def decode_file(
     """Return what `decode` makes of a file of at most `limit` bytes.
 
     `decode` raises ContentError or pydantic's error for a bad content; the texts are for messages.
-    InputError if the file is unreadable, too large, or invalid.
+
+    Raises:
+        InputError: the file is unreadable, too large, or invalid.
     """
     try:
         size = path.stat().st_size

@@ -61,8 +61,10 @@ def read_cvat(content: bytes) -> list[AnnotatedImage]:
     """Read the images of a CVAT for images file, in its order.
 
     A skeleton and a box of one detection or one group are one person; a skeleton alone has the box
-    around its points. Shapes of other kinds or labels are ignored. ContentError if the file has
-    another format, or a shape is invalid.
+    around its points. Shapes of other kinds or labels are ignored.
+
+    Raises:
+        ContentError: the file has another format, or a shape is invalid.
     """
     root = read_xml(content)
     if root.tag != "annotations":
@@ -278,8 +280,10 @@ def read_label_studio(content: bytes) -> list[AnnotatedImage]:
     """Read the images of a Label Studio export, in its order.
 
     For each task the last annotation that was not cancelled is used, or else the last prediction. A
-    keypoint belongs to its parent rectangle, or else to the only one around it. ContentError if the
-    file has another format, or a region is invalid.
+    keypoint belongs to its parent rectangle, or else to the only one around it.
+
+    Raises:
+        ContentError: the file has another format, or a region is invalid.
     """
     return [_read(task) for task in TypeAdapter(tuple[_Task, ...]).validate_json(content)]
 

@@ -52,7 +52,10 @@ def write_slahmr_cameras(path: Path, camera: Camera) -> None:
     Members: `height`, `width`, `focal` [px], `intrins` (frames, 4) fx fy cx cy [px] and `w2c`
     (frames, 4, 4), in world axes with y down: x as in the world, z along the world's y. The method
     has no distortion model. Layout: vye16/slahmr at commit 58518fe, slahmr/data/dataset.py
-    (`load_cameras_npz`). InputError if a frame has no camera.
+    (`load_cameras_npz`).
+
+    Raises:
+        InputError: a frame has no camera.
     """
     missing = np.flatnonzero(np.isnan(camera.numbers).any(-1))
     if len(missing):
@@ -294,7 +297,9 @@ def read_pickled(path: Path) -> Part:
     """Return the content of a file: dictionaries, lists, numbers, text and arrays.
 
     `worldpose.pickles` reads pickles, also of joblib, numpy and torch, and runs nothing in them.
-    InputError if the file is not readable, or names classes that no result needs.
+
+    Raises:
+        InputError: the file is not readable, or names classes that no result needs.
     """
     try:
         content = read_pickle(path)
