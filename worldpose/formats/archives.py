@@ -56,9 +56,15 @@ def write_archive(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 def read_archive(
     path: Path, members: Mapping[str, Member], only: Collection[str] | None = None
 ) -> dict[str, NDArray[Any]]:
-    """Return float64, int64 and str arrays of an npz file that has these members and no others.
+    """Read the arrays of an npz file after validating their types, shapes and sizes.
 
-    Types, shapes and sizes are checked first; only the requested members are loaded, None = all.
+    Args:
+        path: the file.
+        members: expected content; no other member is allowed.
+        only: requested members; None = all. The others are not loaded.
+
+    Returns:
+        float64, int64 and str arrays by name; optional members that are absent are left out.
 
     Raises:
         InputError: the file is absent, truncated, too large or no npz, or has members that are
@@ -84,7 +90,11 @@ def wrong(
 
 
 def read_npz(path: Path, limit: int) -> dict[str, NDArray[np.generic]]:
-    """Return all arrays of an npz file by name, unpacked together at most `limit` bytes.
+    """Return all arrays of an npz file by name.
+
+    Args:
+        path: written by `numpy.savez` or `numpy.savez_compressed`.
+        limit: maximum unpacked size of all arrays together [byte].
 
     Raises:
         InputError: the file is no npz, truncated or too large, or has Python objects or
@@ -99,7 +109,11 @@ def read_npz(path: Path, limit: int) -> dict[str, NDArray[np.generic]]:
 
 
 def open_npz(path: Path) -> zipfile.ZipFile:
-    """Return the archive; InputError if the file is none."""
+    """Return the archive.
+
+    Raises:
+        InputError: the file is no archive.
+    """
     try:
         return zipfile.ZipFile(path)
     # ValueError and NotImplementedError: a damaged directory, or one of a later version.
@@ -162,7 +176,11 @@ def _read_header(path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo) -> He
 def require_size(
     path: Path, infos: Collection[zipfile.ZipInfo], limit: int, ratio: int | None = None
 ) -> None:
-    """Raise InputError for arrays beyond `limit` bytes, and for excessive compression ratios."""
+    """Raise InputError for arrays beyond `limit` bytes, and for excessive compression ratios.
+
+    Raises:
+        InputError: the arrays are too large, or compressed too much; the error names the file.
+    """
     total = sum(info.file_size for info in infos)
     # The archive's directory may state more bytes than the file has.
     packed = min(sum(info.compress_size for info in infos), path.stat().st_size)
@@ -182,7 +200,11 @@ def require_size(
 def read_array(
     path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo, form: Member | None = None
 ) -> NDArray[Any]:
-    """Return a member's array, in the type of its form; InputError if its bytes are damaged."""
+    """Return a member's array, in the type of its form; check its header and size first.
+
+    Raises:
+        InputError: the bytes are damaged.
+    """
     read_as = {"float": np.float64, "int": np.int64, "text": np.str_}
     dtype = None if form is None else form.dtype or read_as[form.kind]
     try:

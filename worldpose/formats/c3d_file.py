@@ -27,7 +27,7 @@ _Value = str | Sequence[str] | np.generic | NDArray[np.generic]
 def write_c3d(
     path: Path, tracks: JointTracks, person: int, fps: float, notes: Mapping[str, str]
 ) -> None:
-    """Write the joints of one person, an index in `tracks`, as a C3D file, whole or not at all.
+    """Write the joints of one person as a C3D file, whole or not at all.
 
     Points are the 17 joints, and heels and toes where the clip has them, in millimetres, x, y and z
     as in the world, z up, in single precision: 0.004 mm at 60 m. Frame 1 is the first frame of
@@ -35,7 +35,14 @@ def write_c3d(
     in time. The residual of a joint is its standard deviation, the mean over the axes, in whole
     millimetres from 1; it is 0, which the format reserves for computed points, if no camera
     contributes, and -1 if the joint is missing. Events mark the clip's begin and end, and group
-    WORLDPOSE holds the notes, by parameter name.
+    WORLDPOSE holds the notes.
+
+    Args:
+        path: the file.
+        tracks: joints of several people.
+        person: index of the person in `tracks`.
+        fps: frames per second.
+        notes: texts for the group WORLDPOSE by parameter name.
 
     Raises:
         InputError: the clip has no or too many frames, or a note is too long.

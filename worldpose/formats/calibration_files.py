@@ -68,7 +68,12 @@ def build_camera(
 ) -> CameraCalibration:
     """Return the camera record; a rounded matrix becomes the nearest rotation.
 
-    Rotation (3, 3) and translation [m] are those of x_cam = R x_world + t.
+    Args:
+        where: file and camera, for messages.
+        name: id of the camera.
+        optics: image size, camera matrix and lens.
+        rotation: (3, 3), R in x_cam = R x_world + t.
+        translation: t [m].
 
     Raises:
         InputError: the size is not whole, a focal length is not positive, the matrix is no
@@ -128,7 +133,11 @@ def camera_id(name: str) -> str:
 def index_by_name(
     path: Path, cameras: list[tuple[str, CameraCalibration]]
 ) -> dict[str, CameraCalibration]:
-    """Return the cameras by id, in file order, from pairs of place in the file and camera.
+    """Return the cameras by id, in file order.
+
+    Args:
+        path: the file, for messages.
+        cameras: pairs of place in the file and camera.
 
     Raises:
         InputError: there is no camera, two cameras have one name, or no camera has a pose.
@@ -171,9 +180,11 @@ def read_calibration_toml(
 ) -> dict[str, CameraCalibration]:
     """Return the cameras of a TOML file by name, in file order.
 
-    `left_out` receives cameras without a pose; None = all must have one. `sizes` are those of
-    videos [px], for files whose size is no whole number: programs that do not know it write twice
-    the principal point.
+    Args:
+        path: the file.
+        left_out: receives cameras without a pose; None = all must have one.
+        sizes: width and height [px] of videos, for files whose size is no whole number: programs
+            that do not know it write twice the principal point.
 
     Raises:
         InputError: an entry is missing or invalid, the unit is another, or the world
@@ -365,10 +376,16 @@ def read_camera_table(
     axes: NDArray[np.float64] | None = None,
     where_pose: str | None = None,
 ) -> CameraCalibration:
-    """Return the camera of a table of numbers and lists of them, by a form's names of entries.
+    """Return the camera of a table.
 
-    The translation is in `unit_m` [m]. `axes` (3, 3) is the rotation A from the world of the file
-    to one with z up, x' = A x. `where_pose` is the place of the pose, if it is in another file.
+    Args:
+        where: file and camera, for messages.
+        name: id of the camera.
+        table: entries by key, as numbers and lists of them.
+        keys: the form's names of the entries.
+        unit_m: unit of the translation [m].
+        axes: (3, 3) rotation A from the world of the file to one with z up, x' = A x; None = none.
+        where_pose: as `where`, for the pose, if it is in another file.
 
     Raises:
         InputError: an entry is missing, misshapen, infinite or impossible.

@@ -74,7 +74,14 @@ class Form(NamedTuple):
 
 
 def read_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
-    """Return the cameras of a calibration by name, in file order; see `read_calibration`."""
+    """Return the cameras of a calibration by name, in file order.
+
+    Args:
+        path: file or folder as in `read_calibration`.
+
+    Raises:
+        InputError: an unknown form, or an invalid entry, with file and key.
+    """
     from worldpose.geometry.cameras import Camera  # late: most commands only check calibrations
 
     left_out = LeftOut()
@@ -91,11 +98,13 @@ def read_calibration(
     *,
     any_unit: bool = False,
 ) -> dict[str, CameraCalibration]:
-    """Return the cameras of a file of one of `FORMS`, or of a folder with one calibration, by name.
+    """Return the cameras of a calibration by name, in file order.
 
-    `sizes` may be missing in the file, such as those of the videos. `left_out` receives cameras
-    without a pose, with the reason; None = all must have one. With `any_unit`, cameras may be as
-    far apart as in another unit than the form's.
+    Args:
+        path: a file of one of `FORMS`, or a folder that has one calibration.
+        sizes: image sizes that the file may lack, such as those of the videos.
+        left_out: receives cameras without a pose, with the reason; None = all must have one.
+        any_unit: whether cameras may be as far apart as in another unit than the form's.
 
     Raises:
         InputError: an unknown form, a folder with no calibration or several, or an invalid entry,

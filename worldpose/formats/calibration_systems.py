@@ -40,8 +40,11 @@ def read_calibration_xml(
     """Return the cameras of a calibration of Qualisys, Vicon or OptiTrack, in file order.
 
     The root element tells the system: `calibration`, `Cameras` or `calibrationProfile`. Parameters
-    that Qualisys' server states (`QTM_Parameters_Ver_...`) contain the first. `left_out` receives
-    cameras that are not calibrated; None = all must be.
+    that Qualisys' server states (`QTM_Parameters_Ver_...`) contain the first.
+
+    Args:
+        path: the file.
+        left_out: receives cameras that are not calibrated; None = all must be.
 
     Raises:
         InputError: the file is unreadable, of another program, or has a missing attribute, no

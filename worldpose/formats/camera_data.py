@@ -65,11 +65,14 @@ def write_camera_data(path: Path, data: CameraData) -> None:
 def read_camera_data(
     path: Path, fps: float, size: tuple[int, int], first: int | None = None, *, number: int = -1
 ) -> CameraData:
-    """Return the camera data of FreeD packets, also in a capture (pcap), or of a table (CSV, TSV).
+    """Return the camera data of a file.
 
-    `fps` is the video's, for time codes and the times of captures; `size` is that of the image
-    [px], for fields of view; `first` is the video's number of the first row, None = the table's,
-    else 0; `number` is FreeD's number of the camera, -1 = there is only one.
+    Args:
+        path: FreeD packets one after another, or in a capture (pcap), or a table (CSV, TSV).
+        fps: images per second of the video, for time codes and the times of captures.
+        size: width and height of the image [px], for fields of view.
+        first: number in the video of the first row; None = the table's number, else 0.
+        number: FreeD's number of the camera; -1 = there is only one.
 
     Raises:
         InputError: another form, a wrong checksum, a missing or unknown column, no number, frames
@@ -386,7 +389,10 @@ def _focal_lengths(path: Path, columns: Mapping[str, Floats], size: tuple[int, i
 def apply_zoom_table(data: CameraData, path: Path, size: tuple[int, int]) -> CameraData:
     """Return camera data with the focal lengths of their zoom counts, linear between the rows.
 
-    The table of the lens has a column zoom, and one of the focal length or field of view.
+    Args:
+        data: camera data with zoom counts.
+        path: a table of the lens: the column zoom, and one of the focal length or field of view.
+        size: width and height of the image [px].
 
     Raises:
         InputError: the table is invalid, or its focal length does not only rise or only fall.

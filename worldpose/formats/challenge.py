@@ -51,12 +51,17 @@ class ChallengeTruth:
 
 
 def challenge_truth(model: BodyModel, poses: BodyParameters, camera: Camera) -> ChallengeTruth:
-    """Return boxes and skeletons of fitted bodies (persons, frames) in the moving camera's image.
+    """Return boxes and skeletons of fitted bodies in the moving camera's image.
 
     A box contains the part of a body inside the image; a person outside the image has neither box
     nor skeleton in that frame. Skeletons are BODY25 and extend beyond the image border. `skel_3d`
     is the ideal result of a single-view estimator: the skeleton in the camera's axes, with the
-    mid-hip as origin. The camera (frames,) is NaN where a frame has none.
+    mid-hip as origin.
+
+    Args:
+        model: body model of the parameters.
+        poses: (persons, frames).
+        camera: (frames,); NaN where a frame has no camera.
     """
     persons, frames = poses.batch_shape
     points = fold_keypoints(model, BODY25)
@@ -186,8 +191,11 @@ def fill_submission(joints: Floats, places: Floats) -> tuple[Floats, int]:
     """Return joints (persons, frames, 15, 3) [m] without gaps, and the number of poses added.
 
     A challenge scores every box, also where no body could be fitted. Such a frame takes the
-    person's body of the nearest frame, or else the mean of all bodies, at the person's place
-    (persons, frames, 2) [m] below the mid-hip. All is in the world, and NaN where unknown.
+    person's body of the nearest frame, or else the mean of all bodies, at the person's place.
+
+    Args:
+        joints: (persons, frames, 15, 3) [m], world; NaN without a body.
+        places: (persons, frames, 2) [m], world, below the mid-hip; NaN where unknown.
     """
     hips = [CHALLENGE15.index(name) for name in ("right_hip", "left_hip")]
     root = joints[..., hips, :2].mean(axis=-2)
@@ -222,7 +230,11 @@ def write_pitch_points(path: Path, points: Floats) -> None:
 
 
 def read_challenge(folder: Path, only: str | None = None) -> dict[str, ChallengeClip]:
-    """Read the clips of a challenge folder of either edition by name, or `only` the requested one.
+    """Read the clips of a challenge folder of either edition, by name.
+
+    Args:
+        folder: the folder.
+        only: the requested clip, if it is there; None = all. No other is loaded.
 
     Raises:
         InputError: the file is absent, has wrong types or shapes, or kinds that disagree; the error
@@ -280,10 +292,14 @@ def is_submission(path: Path) -> bool:
 
 
 def read_submission(path: Path, only: Collection[str] | None = None) -> dict[str, Floats]:
-    """Read joints (persons, frames, 15, 3) [m, world] of a submission by clip; None = all clips.
+    """Read the joints (persons, frames, 15, 3) [m, world] of a submission by clip.
 
     It is an npz, zipped or bare, or a table as of 2025, with a row for each joint of sequence,
     frame, person, joint, x, y, z. A table's last persons and frames are those with a joint.
+
+    Args:
+        path: the file.
+        only: requested clips; None = all. The others are not loaded.
 
     Raises:
         InputError: there is no such file, no submission in it, or arrays of another type or shape.

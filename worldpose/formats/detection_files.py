@@ -33,10 +33,13 @@ from worldpose.parsing import read_cells
 
 
 def read_openpose_folder(folder: Path, model: str | None = None) -> PeopleFile:
-    """Return the people of one camera's JSON files; `keypoint_sets` tells their points.
+    """Return the people of one camera; `worldpose.formats.keypoint_sets` tells their points.
 
     `frame_numbers` finds the frame in a file's name. An empty file is a frame without people.
-    `model` is Pose2Sim's name of the pose model, if it is known.
+
+    Args:
+        folder: holds a JSON file for each frame.
+        model: Pose2Sim's name of the pose model, if it is known.
 
     Raises:
         InputError: there are no frames, two files for the same frame, no JSON of OpenPose, or an
@@ -151,7 +154,12 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
     of which 1 is a person and -1 is not known; of 8 or 10 numbers, 0 is one if no box has these.
     Of 10 numbers it may be VisDrone's, which has persons of class 1 and 2, or a place in the world.
     Frames begin at 1, and (1, 1) is the upper left corner of the image. Trackers follow people out
-    of the image: such boxes are left out. Size [px] and number of frames are those of the video.
+    of the image: such boxes are left out.
+
+    Args:
+        file: the text.
+        size: width and height of the video [px].
+        frames: number of frames of the video.
 
     Raises:
         InputError: the file is unreadable or empty, a line has no such numbers, a frame that the

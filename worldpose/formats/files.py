@@ -279,10 +279,17 @@ class JsonItems:
     def __init__(
         self, path: Path, key: str, limit: int, keep: Collection[str] = (), other_key: str = ""
     ) -> None:
-        """Prepare reading a file of at most `limit` bytes.
+        """Prepare reading.
 
-        `key` or `other_key` is that of the list if the file is a mapping; values of `keep` are
-        kept.
+        Args:
+            path: the file.
+            key: key of the list if the file is a mapping.
+            limit: maximum size of the file [byte].
+            keep: further keys of the mapping whose values are kept.
+            other_key: another name of the key.
+
+        Raises:
+            InputError: no such file, or too large.
         """
         require_file(path, limit)
         self.path, self.keys = path, (key, other_key)

@@ -117,8 +117,10 @@ class _File:
     ) -> int:
         """Append an array (rows, ...); return the index of its accessor.
 
-        It is of int16 (fractions), uint8, uint16, uint32 or float32. `target` is the use of
-        vertices and indices; `bounds` states the extreme values.
+        Args:
+            array: (rows, ...) of int16 (fractions), uint8, uint16, uint32 or float32.
+            target: use of the data, for vertices and indices.
+            bounds: state the extreme values.
         """
         self.blob += b"\0" * (-len(self.blob) % 4)
         view = {"buffer": 0, "byteOffset": len(self.blob), "byteLength": array.nbytes}
@@ -159,13 +161,19 @@ def write_gltf(
     each joint's compensates for the rounding of its parents, so that errors do not add up. The
     surface has the person's shape and the model's skinning weights, without pose correctives.
 
-    Cameras, single or (frames,) with NaN where unknown, have the focal length and pose, and their
-    `extras` the rest: image size, principal point and distortion, and of a moving camera the focal
-    length of every frame, and the distortion where it changes, since glTF cannot animate them.
+    Cameras have the focal length and pose, and their `extras` the rest: image size, principal
+    point and distortion, and of a moving camera the focal length of every frame, and the
+    distortion where it changes, since glTF cannot animate them.
 
-    `people` have the same frames, of which 0 is at 0 s; `markings` are lines (points, 3) [m],
-    world; `notes` are the file's `extras`, and `licence` its copyright; `surface` writes that of
-    bodies, not only their joints.
+    Args:
+        path: the file.
+        model: body model of the poses.
+        people: bodies over the same frames.
+        fps: frames per second; frame 0 is at 0 s.
+        cameras: cameras by name, single or one per frame, with NaN where unknown.
+        markings: lines on the pitch (points, 3) [m], world.
+        notes: texts for the file's `extras`; `licence` is its copyright.
+        surface: write the surface of bodies, not only their joints.
 
     Raises:
         InputError: no person has a body.
@@ -423,8 +431,12 @@ def paint_strips(markings: Sequence[Floats]) -> tuple[Floats, Integers]:
 def _quantize_rotations(rotations: Floats, parents: NDArray[np.int64]) -> NDArray[np.int16]:
     """Return quaternions x y z w (frames, joints, 4) relative to the parents, in 16 bits.
 
-    A joint's rotation relative to the world (frames, joints, 3, 3) is rounded once only: the next
-    one is relative to what its parent became by rounding.
+    A joint's rotation relative to the world is rounded once only: the next one is relative to what
+    its parent became by rounding.
+
+    Args:
+        rotations: (frames, joints, 3, 3), relative to the world.
+        parents: (joints,).
     """
     rounded = np.empty((*rotations.shape[:2], 4), np.int16)
     became = np.empty_like(rotations)

@@ -166,8 +166,12 @@ def _either(pairs: Flags) -> Flags:
 def read_people(path: Path) -> PeopleFile:
     """Return the people of one camera, and what was changed to read them.
 
-    It is `.json` (`read_coco_results`), `.npz` (`read_keypoint_arrays`), or a folder with a JSON
-    file of OpenPose for each frame (`read_openpose_folder`).
+    Args:
+        path: `.json` (`read_coco_results`), `.npz` (`read_keypoint_arrays`), or a folder with a
+            JSON file of OpenPose for each frame (`read_openpose_folder`).
+
+    Raises:
+        InputError: the file is unreadable or invalid; the error names file and place.
     """
     if path.is_dir():
         return read_openpose_folder(path)
@@ -177,9 +181,15 @@ def read_people(path: Path) -> PeopleFile:
 
 
 def read_observations(path: str | os.PathLike[str]) -> KeypointDetections:
-    """Return what `read_people` reads, dense from the first to the last frame in the file.
+    """Return the detections of one camera, dense from the first to the last frame in the file.
 
     Frames that the file lacks have no people.
+
+    Args:
+        path: a file or folder that `read_people` reads.
+
+    Raises:
+        InputError: the file is unreadable or invalid; the error names file and place.
     """
     path = Path(path)
     people = read_people(path).people
@@ -192,8 +202,12 @@ def select_ranges(
 ) -> KeypointDetections:
     """Return the people of `path`, dense over ranges of the camera's own frames.
 
-    Ranges, first frame and number of frames, are rising and disjoint. Frames outside are left out;
-    frames that the file lacks have no people.
+    Frames outside are left out; frames that the file lacks have no people.
+
+    Args:
+        path: the file, for messages.
+        people: its people.
+        ranges: first frame and number of frames of each range, rising and disjoint.
 
     Raises:
         InputError: all people are outside the wanted frames, or these are too many.

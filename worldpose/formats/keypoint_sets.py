@@ -207,10 +207,12 @@ def _plain(name: str) -> str:
 
 
 def order_by_points(where: str, points: AnyFloats, stated: str | None = None) -> PointOrder:
-    """Return the order of points whose number alone is known, and perhaps a model of `MODELS`.
+    """Return the order of points whose number alone is known, and perhaps a model.
 
-    `points` (people, points, 3) are x, y [px] and confidence, 0 = missing. A stated model counts if
-    it has this number of points.
+    Args:
+        where: file, for messages.
+        points: (people, points, 3) x, y [px] and confidence; 0 = missing.
+        stated: name in `MODELS`, which counts if it has this number of points.
 
     Raises:
         InputError: no set has this number of points, or their lengths are those of another set or
@@ -307,9 +309,11 @@ def unknown_size(where: str, size: int) -> InputError:
 def _misfit(points: AnyFloats, pairs: NDArray[np.int64], lengths: Floats, least: int = 8) -> float:
     """Return the mean deviation of people's lengths [log] from the usual ones; NaN if unknown.
 
-    `points` are (people, points, 3), `pairs` (bones, 2, 2) places of the ends of the left and right
-    bone, `lengths` (bones,) usual ones, of which only ratios count. `least` bones have to be known;
-    with 8 of 10 the face may be hidden.
+    Args:
+        points: (people, points, 3).
+        pairs: (bones, 2, 2) places of the ends of the left and right bone.
+        lengths: (bones,) usual lengths, of which only ratios count.
+        least: fewest bones that have to be known; with 8 of 10 the face may be hidden.
     """
     sample = 2000  # people whose lengths are compared; more add nothing
     some = points[:: max(1, len(points) // sample)]
@@ -374,9 +378,13 @@ def people_by_frame(
 ) -> tuple[KeypointDetections, int]:
     """Return people by rising frame, and the number of entries that are nobody.
 
-    Of n entries: `frames` (n,); `points` (n, 17 or 23, 3) COCO-17 and perhaps `FEET`, confidence 0
-    = missing; `boxes` (n, 4) x, y, width, height [px], NaN = that of the joints; `scores` (n,), NaN
-    = the mean confidence of the joints. Arrays have at most `limit` bytes.
+    Args:
+        path: the file, for messages.
+        frames: (n,) frame of each entry.
+        points: (n, 17 or 23, 3) COCO-17 and perhaps `FEET`; confidence 0 = missing.
+        boxes: (n, 4) x, y, width, height [px]; NaN or None = that of the joints.
+        scores: (n,) NaN or None = the mean confidence of the joints.
+        limit: maximum size of the arrays [byte].
 
     Raises:
         InputError: too many people in a frame, or arrays that are too large.

@@ -64,11 +64,13 @@ def read_lenses(
 ) -> dict[str, LensCalibration]:
     """Return lenses by camera.
 
-    `files` are one TOML file with a table for each camera; or, for one camera, an OpenCV XML, YAML
-    or JSON file, TOML without tables, an npz file, or two npy files, one of them the 3 x 3 matrix.
-    Kalibr's YAML, and JSON of multical and Panoptic Studio, name their cameras too. `camera` is
-    that of a file that names none. A lens of a file with another size than `sizes`, those of each
-    camera's images [px], and the same shape of image is scaled.
+    Args:
+        files: one TOML file with a table for each camera; or, for one camera, an OpenCV XML, YAML
+            or JSON file, TOML without tables, an npz file, or two npy files, one of them the 3 x 3
+            matrix. Kalibr's YAML, and JSON of multical and Panoptic Studio, name their cameras too.
+        camera: the camera of a file that names none; None = a TOML file with names.
+        sizes: width and height of each camera's images [px]. A lens of a file with another size
+            and the same shape of image is scaled.
 
     Raises:
         InputError: a file is unreadable, of another kind, without matrix or distortion; the pixels
@@ -117,9 +119,15 @@ def read_lenses(
 def read_lens_toml(
     file: Path, sizes: Mapping[str, tuple[int, int]], camera: str | None = None
 ) -> dict[str, LensCalibration]:
-    """Return the lenses of a TOML file by camera, or one; `rotation` and `translation` are ignored.
+    """Return the lenses of a TOML file by camera; `rotation` and `translation` are ignored.
 
-    The file may have cameras besides those of `sizes`; errors and sizes are as in `read_lenses`.
+    Args:
+        file: a table for each camera.
+        sizes: as in `read_lenses`; the file may have further cameras.
+        camera: the only camera to read; None = all.
+
+    Raises:
+        InputError: as in `read_lenses`.
     """
     return _lenses(file, camera_tables(file), sizes, camera)
 

@@ -44,11 +44,16 @@ def coco_dataset(
     the keypoints; `track_id` is the person, and `identity_certainty` the probability of that, where
     it is known.
 
-    The camera is single, or (frames,) of a moving one, NaN where a frame has none. `observed`
-    (frames, persons, 17): the camera's observation of the joint was an inlier, or no nearer person
-    hides it in the moving camera. `number` (frames,) is the camera's own frame, not falling; of
-    frames that it shows twice the first one counts; None = the match frames. `move` returns pixels
-    (frames, persons, 17, 2) where the camera shows them, if its view changes within the clip.
+    Args:
+        camera_id: prefix of the image names.
+        camera: a single camera, or (frames,) of a moving one; NaN where a frame has none.
+        tracks: frames are match frames.
+        observed: (frames, persons, 17), the camera's observation of the joint was an inlier, or no
+            nearer person hides it in the moving camera.
+        number: (frames,) the camera's own frame at each frame, not falling; of frames that it shows
+            twice the first one counts. None = the match frames.
+        move: returns pixels (frames, persons, 17, 2) where the camera shows them, if its view
+            changes within the clip.
     """
     width, height = (int(n) for n in camera.image_size.reshape(-1, 2)[0])
     frames, persons = tracks.joints.shape[:2]
@@ -120,9 +125,14 @@ def alphapose_results(
 
     Tools that lift 2D poses, such as MotionBERT, read this list: one entry per person and image,
     by image, with the person as `idx`. A point has confidence 1 if nothing hides it, 0.5 if a
-    nearer person does, and 0 outside the image. Pixels (frames, persons, 26, 2) are NaN where
-    missing, `hidden` (frames, persons, 26) by a nearer person; camera and `number` (frames,) are as
-    in `coco_dataset`.
+    nearer person does, and 0 outside the image.
+
+    Args:
+        pixels: (frames, persons, 26, 2) [px]; NaN where missing.
+        hidden: (frames, persons, 26), by a nearer person.
+        person_ids: (persons,).
+        camera: as in `coco_dataset`.
+        number: (frames,) the camera's own frame, as in `coco_dataset`.
     """
     size = camera.image_size.reshape(-1, 2)[0]
     within = np.all((pixels >= -0.5) & (pixels <= size - 0.5), axis=-1)
@@ -172,12 +182,18 @@ Y_UP: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 def write_markers(path: Path, tracks: JointTracks, person: int, fps: float) -> None:
-    """Write the joints of one person, an index in `tracks`, as a TRC file, whole or not at all.
+    """Write the joints of one person as a TRC file, whole or not at all.
 
     Markers are the 17 joints, and heels and toes where the clip has them.
     Rows cover every frame from the person's first to last joint; a missing joint has empty cells.
     `Frame#` is the match frame plus one, as such files count from one, and `Time` is that of the
     match frame [s]. Coordinates are y up, in millimetres.
+
+    Args:
+        path: the file.
+        tracks: joints of several people.
+        person: index of the person in `tracks`.
+        fps: frames per second.
     """
     trc_decimals = 3  # decimals of all coordinates: a micrometre
     first, markers = _rows(tracks, person)
@@ -217,12 +233,18 @@ BVH_DECIMALS: Final = 6
 
 
 def write_motion(path: Path, model: BodyModel, poses: BodyParameters, fps: float) -> None:
-    """Write one person's motion (frames,) as a BVH file, whole or not at all.
+    """Write one person's motion as a BVH file, whole or not at all.
 
-    The skeleton has the model's 24 joints in T-pose, with the bone lengths of the first frame's
-    betas; leaf joints end in half of their bone, only for display. The root has position and
-    rotation, every other joint its rotation relative to its parent; angles are in degrees and apply
-    in the order z, x, y of the file's axes. Lengths are centimetres and y is up.
+    The skeleton has the model's 24 joints in T-pose, with the bone lengths of the person's betas;
+    leaf joints end in half of their bone, only for display. The root has position and rotation,
+    every other joint its rotation relative to its parent; angles are in degrees and apply in the
+    order z, x, y of the file's axes. Lengths are centimetres and y is up.
+
+    Args:
+        path: the file.
+        model: body model of the parameters.
+        poses: (frames,) poses of one person, complete; the betas are those of the first frame.
+        fps: frames per second.
 
     Raises:
         InputError: there are no frames, or a parameter is missing.
@@ -370,9 +392,13 @@ def opensim_coordinates(model: BodyModel, poses: BodyParameters) -> Floats:
 def write_opensim_motion(
     path: Path, coordinates: Floats, times: Floats, notes: Mapping[str, str]
 ) -> None:
-    """Write `opensim_coordinates` (frames, 27) [deg, m] at times (frames,) [s] as a .mot file.
+    """Write coordinates over time as a .mot file, whole or not at all.
 
-    The file is written whole or not at all; notes are lines of its header.
+    Args:
+        path: the file.
+        coordinates: (frames, 27) [deg, m], as `opensim_coordinates` returns them.
+        times: (frames,) [s].
+        notes: texts of the header, one line each.
 
     Raises:
         InputError: there are no frames, or a value is missing.

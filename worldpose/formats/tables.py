@@ -79,7 +79,11 @@ def write_rows(
 ) -> None:
     """Write a text of header lines and a table, whole or not at all.
 
-    `parts` are arrays (rows,) or (rows, columns) side by side, each with the format of its cells.
+    Args:
+        path: the file.
+        head: lines before the table.
+        parts: arrays (rows,) or (rows, columns) side by side, each with the format of its cells.
+        separator: text between two cells.
     """
     cells = [
         format_cells(values[:, None] if values.ndim == 1 else values, form)
@@ -124,9 +128,14 @@ def joints_table(tracks: JointTracks, fps: float, people: Mapping[int, str]) -> 
 
     Heels and toes follow the 17 joints of a person where the clip has them.
 
-    Columns: frame, time_s (frame / fps), person, kind (of the person, as given by id), joint, x_m,
-    y_m, z_m (world), x_std_m, y_std_m, z_std_m, views (cameras that contribute), filled (no camera
-    does), source (as in `JointTracks`; 0 at heels and toes).
+    Columns: frame, time_s (frame / fps), person, kind (of the person), joint, x_m, y_m, z_m
+    (world), x_std_m, y_std_m, z_std_m, views (cameras that contribute), filled (no camera does),
+    source (as in `JointTracks`; 0 at heels and toes).
+
+    Args:
+        tracks: the joints.
+        fps: frames per second.
+        people: the kind of each person, by id.
     """
     import pandas as pd  # late: it takes half a second
 

@@ -188,7 +188,13 @@ def encode_scene(clip: ViewerClip) -> bytes:
 
 
 def encode_frames(clip: ViewerClip, first: int, count: int) -> bytes:
-    """Return people and moving cameras in `count` frames, a range at most, from index `first`."""
+    """Return people and the moving cameras in some frames.
+
+    Args:
+        clip: the clip.
+        first: index of the first frame.
+        count: number of frames; a part has at most those of a range.
+    """
     here = slice(first, first + min(count, clip.range_frames))
     joints = clip.joints[here]
     arrays: Arrays = {}
@@ -260,9 +266,13 @@ def decode_bodies(scene: bytes, frames: bytes) -> tuple[Floats, Floats]:
 def write_viewer(
     path: Path, page: str, clips: Sequence[ViewerClip], videos: Mapping[str, Path]
 ) -> None:
-    """Write the viewer's built page with clips and their mp4 files inside, whole or not at all.
+    """Write a page with clips inside, which opens from disk without a network.
 
-    It opens from disk without a network.
+    Args:
+        path: the file, written whole or not at all.
+        page: the built page of the viewer, scripts and style inside.
+        clips: the clips.
+        videos: mp4 files by clip.
 
     Raises:
         InputError: nobody is in the clips, or the file would be too large.
@@ -340,11 +350,18 @@ def _pack(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> byte
 def _quantize_rotations(
     model: BodyModel, poses: BodyParameters, there: Flags
 ) -> tuple[NDArray[np.int16], NDArray[np.float32]]:
-    """Return rotation vectors (frames, bodies, 24, 3) relative to the parents, and units [rad].
+    """Return rotation vectors relative to the parents in whole units, and each joint's unit [rad].
 
-    They are whole numbers times each joint's unit (24,); bodies that are not `there` have zeros. A
-    joint's rotation relative to the world is rounded once only: the next one is relative to what
+    A joint's rotation relative to the world is rounded once only: the next one is relative to what
     its parent became by rounding.
+
+    Args:
+        model: body model of the poses.
+        poses: (frames, bodies).
+        there: (frames, bodies), which of them are known; the others get zeros.
+
+    Returns:
+        (frames, bodies, 24, 3), and (24,).
     """
     parents = model.parents
     rotations = model.articulate(poses[there]).rotations

@@ -41,7 +41,11 @@ def read_clicked(
 ) -> dict[str, ClickedMarkings]:
     """Return the clicks of the static cameras of a match folder, in their order.
 
-    `whose` is the pitch in words, for messages; None = names are not checked.
+    Args:
+        folder: the match folder.
+        spec: its match.yaml.
+        pitch: its pitch; None without a pitch.
+        whose: the pitch in words, for messages; None = names are not checked.
 
     Raises:
         InputError: a file belongs to no static camera, or is invalid.
@@ -58,7 +62,13 @@ def read_clicked(
 def read_clicked_markings(
     file: Path, camera: CameraSpec, pitch: PitchSpec | None, whose: str | None = "the pitch"
 ) -> ClickedMarkings:
-    """Return the clicks in one camera's image, a JSON of `ClickedMarkings`; see `read_clicked`.
+    """Return the clicks in one camera's image.
+
+    Args:
+        file: JSON, a `ClickedMarkings`.
+        camera: the camera; all clicks must be inside its image.
+        pitch: the match's pitch; its template defines the names.
+        whose: as in `read_clicked`.
 
     Raises:
         InputError: the file is not JSON, or has an unknown key or name, no number, a repeated name,

@@ -36,10 +36,15 @@ def import_camera_data(
     number: int | None = None,
     zoom_table: Path | None = None,
 ) -> tuple[Path, CameraData]:
-    """Write what `read_camera_data` reads into a match folder; return the new file and its content.
+    """Write camera data into a match folder, and return the new file and its content.
 
-    `view` is None for the only broadcast view, `first` the number in its video of the file's first
-    frame, None = as the file says, `number` FreeD's number of the camera, None = the only one.
+    Args:
+        file: what `read_camera_data` reads.
+        folder: the match folder.
+        view: the broadcast view, None = the only one.
+        first: number in the view's video of the file's first frame; None = as the file says.
+        number: FreeD's number of the camera; None = the only one of the file.
+        zoom_table: focal lengths of the lens by zoom counts.
 
     Raises:
         InputError: a file is invalid or has no frame of the view, or the view has camera data

@@ -70,8 +70,13 @@ def import_challenge(
     one), `boxes/<sequence>.npy`, `videos/<sequence>.mp4` or `images/<sequence>/`,
     `pitch_points.txt`, and possibly `skel_2d/` and `skel_3d/`. Boxes and skeletons have one row
     per person. The boxes become tracks with the row as id, 2D skeletons become keypoints, and 3D
-    skeletons become monocular poses by `lift`. `fps` is by default that of the videos; images have
-    none.
+    skeletons become monocular poses.
+
+    Args:
+        kit: the folder.
+        out: holds the new folders.
+        lift: turns a 3D skeleton into rotations of the body's joints.
+        fps: frames per second [1/s]; None = that of the videos; images have none.
 
     Raises:
         InputError: a file is missing, invalid, or contradicts another one. Nothing is written.

@@ -85,18 +85,20 @@ def import_clicks(
 ) -> ImportedClicks:
     """Write the labelled points of an annotation file into a match folder.
 
-    The file is CVAT for images XML, Label Studio JSON, COCO keypoints JSON or SoccerNet's lines.
     Labels are names of the pitch template or SoccerNet's of lines, without regard to case and
-    spaces, or places in metres: from a corner along the touch line and the goal line, or, if some
-    are negative or clearly more of them are points of the pitch then, from the centre spot. On
-    which side y is positive follows from the clicks: no camera above a pitch sees it mirrored.
-    Places that neither the Laws nor pitch.json name become points of pitch.json. A label that is
-    clicked twice in one image gives two points at one place, from which calibration tells the wrong
-    one.
+    spaces, or places in metres: from a corner along the touch line
+    and the goal line, or, if some are negative or clearly more of them are points of the pitch
+    then, from the centre spot. On which side y is positive
+    follows from the clicks: no camera above a pitch sees it mirrored. Places that neither the Laws
+    nor pitch.json name become points of pitch.json. A label that is clicked twice in one image
+    gives two points at one place, from which calibration tells the wrong one.
 
-    `owner` is the static camera, or the broadcast view whose key frames are numbered by the images'
-    names; None: the images are named after cameras. `pitch` is by default the folder's or the
-    standard one.
+    Args:
+        file: CVAT for images XML, Label Studio JSON, COCO keypoints JSON or SoccerNet's lines.
+        folder: the match folder, with match.yaml.
+        owner: the static camera, or the broadcast view whose key frames are numbered by the images'
+            names; None: the images are named after cameras.
+        pitch: the match's pitch; None = the folder's or the standard one.
 
     Raises:
         InputError: the file has another form; a label is unknown; an image belongs to no camera, or

@@ -43,9 +43,12 @@ def row_rate(where: str, fps: float, frame: Integers | None = None) -> float:
 
 
 def exact_frames(frame: Integers, offset: ClockOffset, rate: float = 1.0) -> Floats:
-    """Return the exact camera frames (n,) of match frames (n,) by the camera's `offset_frames`.
+    """Return the exact camera frames (n,) of match frames (n,).
 
-    `rate` is the camera's frames per frame of the match.
+    Args:
+        frame: match frames.
+        offset: as the camera's `offset_frames`.
+        rate: frames of the camera per frame of the match.
     """
     if not isinstance(offset, Sequence):
         return np.asarray(frame * rate + offset, dtype=np.float64)
@@ -124,10 +127,13 @@ class ImageClock:
 
     @classmethod
     def of(cls, frame: Integers, offset: ClockOffset, rate: float, start: float) -> ImageClock:
-        """Return the clock of a clip with these consecutive match frames (frames,).
+        """Return the clock of a clip with these match frames (frames,), the first with `start`.
 
-        The offset is that of `worldpose.ingest.footage.UnitFrames`, `rate` images per match frame,
-        `start` the exact number of the image at the first match frame.
+        Args:
+            frame: consecutive match frames.
+            offset: as of `worldpose.ingest.footage.UnitFrames`.
+            rate: images per match frame.
+            start: exact number of the image at the first match frame.
         """
         number = camera_frames(frame, offset, rate)
         return cls(number, (number - start) / rate - (frame - frame[0]), rate)

@@ -111,7 +111,12 @@ def read_unit(
 ) -> tuple[KeypointDetections, CameraCalibration | None]:
     """Return detections and given calibration of a static camera or a broadcast view.
 
-    `frame` of the detections are match frames.
+    Args:
+        match: match as read by `read_match`.
+        unit_id: id of a static camera, or name of a broadcast view.
+
+    Returns:
+        Detections with `frame` in match frames, and the calibration if given.
 
     Raises:
         InputError: the match has no such unit, or no or invalid detections for it.
@@ -164,8 +169,13 @@ def read_footage(
 ) -> Footage:
     """Return a video's synchronization with the match's clock, decoding only its first frame.
 
-    Frame rate and image size (width, height) [px] are those of match.yaml, `clips` id, first match
-    frame and number of frames of each; without an index it is read from the video.
+    Args:
+        path: a video file or a folder of images.
+        fps: frames per second of the camera.
+        image_size: width, height from match.yaml [px].
+        frames: the unit's frames in the match.
+        clips: id, first match frame and number of frames of each clip.
+        index: index of the video; None = read it from the video.
 
     Raises:
         InputError: no video, another size or rate, or no frame of any clip.
@@ -248,10 +258,14 @@ def stretches(numbers: NDArray[np.int64]) -> list[list[int]]:
 
 
 def read_still(path: str | os.PathLike[str], image_size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Return the image (height, width, 3), RGB, of a PNG, JPEG, TIFF, BMP or WebP file.
+    """Return the image (height, width, 3), RGB.
+
+    Args:
+        path: a PNG, JPEG, TIFF, BMP or WebP file.
+        image_size: width and height of the camera [px].
 
     Raises:
-        InputError: no such file, no image, or not the camera's image size [px].
+        InputError: no such file, no image, or another image size.
     """
     still_bytes = 1 << 28  # maximum size of a still [byte]; a noisy 4K image has 25 MB
     from worldpose.video.folder import MAX_PIXELS, declared_size, decode_image  # late: as above

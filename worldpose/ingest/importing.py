@@ -203,11 +203,16 @@ def import_lenses(
     """Write lenses without a pose into a match folder's lenses.toml, and return them.
 
     Static calibration takes them as prior of focal length, principal point and distortion; the
-    pose comes from clicks. `camera` is the static camera of a file that names none.
+    pose comes from clicks.
+
+    Args:
+        files: what `read_lenses` reads.
+        folder: the match folder, with match.yaml.
+        camera: the static camera of a file that names none.
 
     Raises:
-        InputError: a file is invalid (`read_lenses`), its camera is unknown or has a lens already,
-            or calibration.toml gives it with its pose.
+        InputError: a file is invalid, its camera is unknown or has a lens already, or calibration
+            .toml gives it with its pose.
     """
     spec = read_spec(folder)
     sizes = image_sizes(spec)
@@ -234,10 +239,16 @@ def pick_cameras(
     suffixes: Collection[str],
     left_out: LeftOut,
 ) -> dict[str, Path]:
-    """Return the file of each camera that has one, of those `found` in a folder by camera.
+    """Return the file of each camera that has one.
 
-    Files of cameras that are left out are ignored; cameras without a file are added to these, and a
-    sentence about files without a camera. `calibration` and `suffixes` are for messages.
+    Args:
+        folder: holds them, for messages.
+        found: its files, by name of a camera.
+        cameras: the cameras.
+        calibration: file of the cameras, for messages.
+        suffixes: endings of such files, for messages.
+        left_out: further cameras, whose files are ignored; cameras without a file are added, and a
+            sentence about files without a camera.
 
     Raises:
         InputError: fewer than two cameras have a file, or than all of fewer cameras.
@@ -269,11 +280,20 @@ def build_spec(
     offsets: Mapping[str, int] = MappingProxyType({}),
     pitch: str | None = "none",
 ) -> MatchSpec:
-    """Return match.yaml of a match with the one clip `clip`; InputError if an entry is invalid.
+    """Return match.yaml of a match with the one clip `clip`.
 
-    `sizes` are the width and height of the cameras' images [px], `frames` the clip's first frame
-    and the one after its last, `videos` the files of those cameras that have one, `offsets` the
-    `offset_frames` of those whose clock is another.
+    Args:
+        out: the match folder, whose name is the match's id if `match_id` is None.
+        match_id: id of the match.
+        fps: frame rate of all cameras [1/s].
+        sizes: width and height of the cameras' images [px].
+        frames: the clip's first frame, and the one after its last.
+        videos: file in `videos/` of those cameras that have one.
+        offsets: `offset_frames` of those cameras whose clock is another.
+        pitch: entry `pitch`.
+
+    Raises:
+        InputError: an entry is invalid.
     """
     content = {
         "match_id": match_id if match_id is not None else name_of(out),

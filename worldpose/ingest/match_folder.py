@@ -129,10 +129,12 @@ def read_match(
 ) -> MatchFolder:
     """Return the validated content of a match folder, without opening videos, stills, detections.
 
-    Videos of the paths `known` may be gone, as their results are at hand. `pitch` is that of the
-    settings, whose names clicks have; None = the folder's or the standard one. Of a venue of
-    match.yaml without pitch.json, names are checked with `pitch` alone. `whose` is that pitch in
-    words, for messages; None = the names of clicks are not checked.
+    Args:
+        folder: contains match.yaml and the files that it names.
+        known: paths in the folder of videos that may be gone, as their results are at hand.
+        pitch: that of the settings, whose names clicks have; None = the folder's or the standard
+            one. Of a venue of match.yaml without pitch.json, names are checked with `pitch` alone.
+        whose: that pitch in words, for messages; None = the names of clicks are not checked.
 
     Raises:
         InputError: the folder is unreadable (its disk is not mounted, or this user has no

@@ -91,7 +91,12 @@ def _check_size(content: Mapping[str, object], usual: PitchSpec, file: str) -> N
 
 
 def _check_points(points: object, pitch: PitchSpec, file: str) -> None:
-    """Raise InputError for the surveyed point farthest from its place in the rules, if too far."""
+    """Raise InputError for surveyed points far from their places in the rules of the game.
+
+    Raises:
+        InputError: points are too far from there; the error names the point of the largest
+            distance.
+    """
     from_laws = 2.0  # maximum distance of a surveyed point from its place in the rules, in plan [m]
     if not isinstance(points, dict):
         return  # the contract says what is wrong with them
@@ -128,7 +133,11 @@ def _is_number(value: object) -> TypeGuard[float]:
 
 
 def refuse_unread_pitch(folder: Path) -> None:
-    """Raise InputError if match.yaml names another pitch than pitch.json, or none."""
+    """Raise InputError if match.yaml names another pitch than pitch.json, or none.
+
+    Raises:
+        InputError: nothing would read pitch.json.
+    """
     file = folder / "match.yaml"
     content = read_yaml(file) if file.exists() else None
     named = content.get("pitch") if isinstance(content, dict) else None

@@ -69,8 +69,17 @@ def import_pose2sim(
     to the cameras in the calibration's order. The shift of `pose-sync/` against `pose/` is the
     clock of a camera's video. `frame_rate` and `frame_range` of Config.toml hold. Where a video is
     smaller or larger than the calibrated images, with or without black bars, its camera is in the
-    video's pixels, as the 2D poses are. `fps` is by default from Config.toml or the videos; other
-    arguments and the result are as in `import_match`.
+    video's pixels, as the 2D poses are.
+
+    Args:
+        project: folder of a trial.
+        out: the match folder, absent or empty.
+        fps: frame rate of all cameras [1/s]; None = from Config.toml or the videos.
+        match_id: id of the match; None = the name of `out`.
+        place: brings the cameras to metres with z up; None = they are.
+
+    Returns:
+        Content of match.yaml, and sentences about what was found and what was left out.
 
     Raises:
         InputError: something is absent, invalid or contradicts the rest; nothing is written then,

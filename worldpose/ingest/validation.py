@@ -23,7 +23,12 @@ R = TypeVar("R", bound=Record)
 
 
 def validate_record(model: type[R], data: object, file: str) -> R:
-    """Return the record in plain data from `file`, without conversions or ignored keys.
+    """Return the record in `data` from `file`, without conversions or ignored keys.
+
+    Args:
+        model: the contract.
+        data: mappings, lists, text and numbers, as returned by a YAML or JSON reader.
+        file: name of the file for messages.
 
     Raises:
         InputError: a key is unknown or missing, or a value is invalid; a misspelt key takes
@@ -127,7 +132,11 @@ def require_local(name: str, where: str) -> None:
 
 @contextmanager
 def reachable(folder: Path) -> Iterator[None]:
-    """Convert OSError in a block that reads a match folder to InputError."""
+    """Convert OSError in a block that reads a match folder to InputError.
+
+    Raises:
+        InputError: the folder, or a file in it, is unreachable or unreadable.
+    """
     try:
         yield
     except OSError as error:
@@ -141,7 +150,9 @@ def reachable(folder: Path) -> Iterator[None]:
 def find_file(folder: Path, name: str) -> Path:
     """Return the path of a file, whose name on disk may differ as the names of `same_name` do.
 
-    The name is relative to the folder; the file need not exist.
+    Args:
+        folder: the folder.
+        name: relative to the folder; it need not exist.
     """
     path = folder
     for part in PurePosixPath(name).parts:
@@ -162,10 +173,16 @@ def same_name(name: str) -> str:
 
 
 def existing_file(folder: Path, name: str, where: str, *, folders: bool = False) -> Path:
-    """Return the path of an existing file in the folder, or of a folder that is not empty.
+    """Return the path of an existing file in the folder.
+
+    Args:
+        folder: the match folder.
+        name: relative to the folder.
+        where: source of the name, for messages.
+        folders: also accept a folder that is not empty.
 
     Raises:
-        InputError: there is no such file, or it is outside; `where` is the source of the name.
+        InputError: there is no such file, or it is outside.
     """
     require_local(name, where)
     try:
@@ -197,10 +214,15 @@ def files_by_unit(
     *,
     alone: bool = False,
 ) -> dict[str, Path]:
-    """Return the files of a subfolder `place` of a match folder by unit, without hidden ones.
+    """Return the files of a subfolder of a match folder by unit, without hidden ones.
 
-    The subfolder need not exist. `suffixes` are endings in small letters; with `alone`, files with
-    other endings are refused, not ignored. `units` are what the known units are, for messages.
+    Args:
+        folder: the match folder.
+        place: the subfolder, which need not exist.
+        suffixes: endings of the files, in small letters.
+        known: the units that may have a file.
+        units: what these units are, for messages.
+        alone: whether files with other endings are refused, not ignored.
 
     Raises:
         InputError: a file belongs to no such unit, or two belong to one; it leads out of the

@@ -58,12 +58,19 @@ def write_match(
     """Write a match folder that `read_match` accepts, atomically.
 
     The function builds and reads back a temporary folder in the same parent, syncs it to disk and
-    renames it to `folder`, which is absent or empty. Calibrations are by static camera, detections
-    by static camera or broadcast view; their `frame` is the camera's own frame number, as in the
-    files, not the match frame. The pitch goes to the file named by `spec.pitch`, else to
-    pitch.json, a still (height, width, 3), RGB, to the camera's `still`, else to
-    stills/<camera>.png. `further` is called with the temporary match folder, to add videos and
-    `reference/`.
+    renames it.
+
+    Args:
+        folder: absent, or an empty folder.
+        spec: match.yaml.
+        calibrations: static cameras by id.
+        observations: detections by id of a static camera or name of a broadcast view; `frame` is
+            the camera's own frame number, as in the files, not the match frame.
+        pitch: written to the file named by `spec.pitch`, else to pitch.json.
+        annotations: clicked markings of the cameras; None = no clicks.
+        stills: images (height, width, 3), RGB, by camera id; written to the file named by the
+            camera's `still`, else to stills/<camera>.png.
+        further: called with the temporary match folder, to add videos and `reference/`.
 
     Raises:
         InputError: the folder exists and is not empty, its disk is full, or the arguments
@@ -213,10 +220,12 @@ def write_offsets(folder: Path, offsets: Mapping[str, ClockOffset]) -> None:
 
 
 def import_boxes(boxes: Path, folder: Path, notes: list[str] | None = None) -> dict[str, int]:
-    """Copy boxes of people into a match folder with videos; return their number by camera or clip.
+    """Copy boxes of people into a match folder; return the number of each camera or clip.
 
-    `boxes` has `<camera>.txt` or `<clip>.txt` (`read_boxes`); the notes receive sentences about
-    boxes that are left out or changed.
+    Args:
+        boxes: folder with `<camera>.txt` or `<clip>.txt` (`read_boxes`).
+        folder: the match folder, with the videos.
+        notes: receives sentences about boxes that are left out or changed.
 
     Raises:
         InputError: a file is invalid, its camera has no video, or has 2D poses or boxes already;
@@ -246,7 +255,11 @@ def copy_boxes(
 ) -> dict[str, int]:
     """Check all files of boxes against the videos, then copy them; return their numbers.
 
-    `indices` are the frames of the video of each camera that may have boxes.
+    Args:
+        boxes: folder with a file of boxes for some of the cameras.
+        indices: frames of the video of each camera that may have boxes.
+        folder: the match folder.
+        notes: as in `import_boxes`.
 
     Raises:
         InputError: there are no files, one of an unknown camera, or an invalid one.

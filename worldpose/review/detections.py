@@ -154,9 +154,13 @@ def find_changes(
     """Return the changes between an export and an annotator's file.
 
     An image that the annotator's file lacks counts as unchanged. Positions closer than a hundredth
-    of a pixel count as equal, since annotation tools round. Exported images are named by
-    `image_name`, their people have a `detection`; edited names can have a folder, or a prefix that
-    ends in `-`, before them.
+    of a pixel count as equal, since annotation tools round.
+
+    Args:
+        exported: named by `image_name`, people with their `detection`.
+        edited: images from the annotator; names can have a folder, or a prefix that ends in `-`,
+            before them.
+        where: the annotator's file, for messages.
 
     Raises:
         InputError: an image that was not exported or has another size, a duplicate person, or an

@@ -52,8 +52,11 @@ def open_detections(
 ) -> OpenDetections:
     """Return the detections of one camera's result that await review.
 
-    `frame` (frames,) are match frames, rising without gaps, `score` (frames, detections) those
-    without corrections, NaN = no detection. A corrected detection counts as reviewed.
+    Args:
+        frame: (frames,) match frames, rising without gaps.
+        score: (frames, detections) without corrections; NaN = no detection.
+        acceptances: acceptances of this result.
+        edits: edits of this camera; a corrected detection counts as reviewed.
     """
     there = np.isfinite(score)
     waits = there.copy()
@@ -97,10 +100,12 @@ def clip_curves(
 ) -> tuple[Curve, ...]:
     """Return the number of people and their uncertainty per frame.
 
-    `bodies` (frames, persons, 17, 3) are keypoints of the fitted bodies [m], world, NaN = no body,
-    with their covariance (frames, persons, 17, 3, 3) [m^2]; `filled` (frames, persons) are bodies
-    from the motion model alone; `placed` are triangulated joints of the same people, NaN where
-    missing.
+    Args:
+        bodies: (frames, persons, 17, 3) keypoints of the fitted bodies [m], world; NaN = no body.
+        covariance: (frames, persons, 17, 3, 3) covariance of these keypoints [m^2].
+        filled: (frames, persons) bodies from the motion model alone.
+        placed: (frames, persons, 17, 3) triangulated joints [m] of the same people; NaN where
+            missing.
     """
     there = np.isfinite(bodies).all(axis=-1)
     people = there.any(axis=-1)
@@ -147,11 +152,15 @@ class ViewCheck:
 
 
 def epipolar_curves(source: Camera, target: Camera, pixel: ArrayLike) -> list[Floats]:
-    """Return the epipolar curves in `target` of a pixel (2,) [px] in `source`, both single cameras.
+    """Return the epipolar curves in `target` of a pixel in `source`.
 
     The function projects the part of the pixel's ray where joints can be into the other image, with
-    lens distortion, and clips it to the image: polylines (n, 2) [px], none if the ray is not
-    visible.
+    lens distortion, and clips it to the image.
+
+    Both are single cameras; the pixel (2,) [px] is one of `source`.
+
+    Returns:
+        Polylines (n, 2) [px] within the image of `target`; none if the ray is not visible.
     """
     edge_halvings = 12  # bisections to the border of the image: 12 px become 0.003 px
     halvings = 8  # maximum number of subdivisions
@@ -200,10 +209,13 @@ def epipolar_curves(source: Camera, target: Camera, pixel: ArrayLike) -> list[Fl
 
 
 def check_views(cameras: Camera, keypoints: ArrayLike) -> ViewCheck:
-    """Return the multi-view consistency of one person in one frame of a batch (cameras,).
+    """Return the multi-view consistency of one person in one frame.
 
     A joint is the nearest point to its rays, with weights from the size of a pixel at its distance.
-    Keypoints (cameras, joints, 2) [px] are NaN where not seen.
+
+    Args:
+        cameras: a batch (cameras,).
+        keypoints: (cameras, joints, 2) [px]; NaN where not seen.
     """
     places = np.asarray(keypoints, dtype=np.float64)
     rays = cameras.unproject(places)

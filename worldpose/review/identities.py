@@ -140,9 +140,11 @@ def add_plane_tracks(
 ) -> Identities:
     """Add people on the plane, and the frames in which the feet place triangulated people.
 
-    Of tracks by feet: `detection_index` (frames, cameras, tracks), as in `Identities`; `is_placed`
-    (frames, tracks), whether the track has a place; `continues` (tracks,) index in `found.person`
-    of the triangulated person, -1 = none.
+    Args:
+        found: triangulated people.
+        detection_index: (frames, cameras, tracks), as in `Identities`, of tracks by feet.
+        is_placed: (frames, tracks), whether the track has a place.
+        continues: (tracks,) index in `found.person` of the triangulated person; -1 = none.
     """
     index, on_plane = found.detection_index.copy(), found.on_plane.copy()
     for n in np.flatnonzero(continues >= 0):

@@ -241,9 +241,12 @@ def requests_by_id(records: Iterable[ReviewRecord]) -> dict[str, ReviewRequest]:
 def last_decision(
     records: Iterable[ReviewRecord], unit: str, content: str
 ) -> ReviewDecision | None:
-    """Return the last verdict on the bytes of a `stage/unit`'s result, None without a decision.
+    """Return the last verdict on a result's bytes, None without a decision.
 
-    `content` is the digest of its files; its key may differ from that at the decision.
+    Args:
+        records: records of the journal, in order.
+        unit: unit as `stage/unit`.
+        content: digest of the result's files; its key may differ from that at the decision.
     """
     about: set[str] = set()
     last = None

@@ -106,8 +106,12 @@ def train(
     """Train a net and return its checks; the net then has the weights of the best one.
 
     A check also runs before the first step: training that makes the net worse changes nothing,
-    unless the settings keep the last weights. The checkpoint is written at every check; if the file
-    exists, training resumes from it. `progress` receives a line at every check.
+    unless the settings keep the last weights.
+
+    Args:
+        training: net, batches, loss, metric and settings.
+        checkpoint: written at every check; if the file exists, training resumes from it.
+        progress: receives a line at every check.
 
     Raises:
         InputError: the checkpoint is of another training.
@@ -342,8 +346,13 @@ def fine_tune(
 ) -> FineTuned:
     """Fine-tune a net on labels and return its metrics; the weights are written in any case.
 
-    Images with reviewed labels are in the order of recording. A killed training resumes with the
-    checkpoint next to the weights. `start` are initial weights; None = the shipped ones.
+    Args:
+        kind: which net.
+        pictures: images with reviewed labels, in the order of recording.
+        weights: the file to write; with the checkpoint next to it a killed training resumes.
+        settings: the defaults if None.
+        start: initial weights; the shipped ones if None.
+        progress: receives a line at every check.
 
     Raises:
         InputError: too few frames, a subset without people, or weights of another net.

@@ -130,8 +130,12 @@ def keypoint_batch(
 ) -> KeypointBatch:
     """Return a batch; the same generator gives the same one.
 
-    `people` of `labelled_people` are drawn with equal probability; `flip` (points,) is the number
-    of each point's mirror image, for labels of other points than joints.
+    Args:
+        people: drawn with equal probability, from `labelled_people`.
+        cache: reads their images.
+        settings: number and augmentation of the crops.
+        rng: draws people, errors of boxes and augmentations.
+        flip: (points,) number of each point's mirror image, for labels of other points than joints.
     """
     count = settings.crops
     crops = np.empty((count, CROP[1], CROP[0], 3), dtype=np.uint8)
@@ -299,7 +303,10 @@ def keypoint_loss(net: KeypointNet, batch: KeypointBatch) -> Tensor:
 def box_loss(batch: KeypointBatch, said: Tensor, fit: Tensor) -> Tensor:
     """Return the loss of boxes, and of their fit, the expected overlap with any person's box.
 
-    The net gives boxes (crops, 4) [px of the crop] and logits of the fit (crops,).
+    Args:
+        batch: the truth.
+        said: (crops, 4) [px of the crop].
+        fit: (crops,) logits.
     """
     boxes, people, ignored = (
         torch.from_numpy(each).to(said.device)

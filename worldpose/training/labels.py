@@ -94,8 +94,11 @@ def read_labels(annotations: Path, pictures: Path | None = None) -> list[Labelle
 
     `iscrowd` 1 marks ignored people. Boxes are x, y, width, height in the pixels of the keypoints,
     which begin at the centre of the top-left pixel. The categories name the order of keypoints;
-    annotations of categories without keypoints or a name of people are left out, and said. The
-    images are by default in the folder of the JSON file.
+    annotations of categories without keypoints or a name of people are left out, and said.
+
+    Args:
+        annotations: the JSON file.
+        pictures: the folder of the images; the folder of the JSON file if None.
 
     Raises:
         InputError: the file is no COCO keypoints data set, or an image lies outside of the folder
@@ -198,7 +201,13 @@ def _orders(
 def write_labels(
     annotations: Path, pictures: Sequence[LabelledPicture], size: tuple[int, int]
 ) -> None:
-    """Write a COCO keypoints data set of images of one size [px] within the folder of its file."""
+    """Write a COCO keypoints data set; image names are relative to the file's folder.
+
+    Args:
+        annotations: the JSON file.
+        pictures: within its folder.
+        size: width, height of the images [px].
+    """
     images: list[dict[str, Any]] = []
     people: list[dict[str, Any]] = []
     for number, picture in enumerate(pictures):

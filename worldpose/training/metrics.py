@@ -120,9 +120,13 @@ def average_precision(
     """Return the area under the curve of precision over recall [1]; NaN without wanted people.
 
     As in COCO, the best boxes choose first, and each chooses the person that it overlaps most.
-    Ignored people, people of other heights [px], and boxes on them count neither as true nor as
-    false positives. The same applies to boxes of other heights that match no person. Of the range
-    of heights the lower bound is included, the upper not.
+    Ignored people, people of other heights, and boxes on them count neither as true nor as false
+    positives. The same applies to boxes of other heights that match no person.
+
+    Args:
+        found: detections in each image.
+        labels: the truth of the same images.
+        heights: range of wanted people, lower bound included, upper not [px].
     """
     scores, right = [], []
     asked = 0
@@ -178,8 +182,11 @@ def judge_boxes(people: People, picture: LabelledPicture) -> tuple[Floats, Flags
 def correct_keypoints(found: AnyFloats, true: Floats) -> Floats:
     """Return 1 for keypoints within a fifth of the torso, else 0 (people, 17); NaN without truth.
 
-    A torso is as long as the longer diagonal from a shoulder to the other side's hip. Keypoints are
-    (people, 17, 2) [px]; a missing found one is not correct.
+    A torso is as long as the longer diagonal from a shoulder to the other side's hip.
+
+    Args:
+        found: (people, 17, 2) [px]; a missing one is not correct.
+        true: (people, 17, 2) [px]; NaN where unknown.
     """
     error = np.linalg.norm(found - true, axis=-1)
     torso = np.linalg.norm(true[:, (5, 6)] - true[:, (12, 11)], axis=-1).max(axis=-1)
@@ -188,9 +195,12 @@ def correct_keypoints(found: AnyFloats, true: Floats) -> Floats:
 
 
 def calibration_error(confidence: Floats, right: Flags, classes: int = 10) -> float:
-    """Return the mean gap between confidence (keypoints,) in (0, 1] and share of correct ones [1].
+    """Return the mean gap between confidence and share of correct ones [1], over equal bins.
 
-    Bins of confidence have equally many keypoints each.
+    Args:
+        confidence: (keypoints,) in (0, 1].
+        right: (keypoints,)
+        classes: bins of confidence, with equally many keypoints each.
     """
     order = np.argsort(confidence, kind="stable")
     parts = np.array_split(order, min(classes, len(order)))

@@ -245,7 +245,15 @@ class VideoReader(Pictures):
     """A video file with access to frames by number, forwards without seeking."""
 
     def __init__(self, path: Path, index: FrameIndex | None = None) -> None:
-        """Open a file, whose index is computed if it is None; InputError if it is no video."""
+        """Open a file.
+
+        Args:
+            path: the video.
+            index: index of the video; if None, it is computed.
+
+        Raises:
+            InputError: no video.
+        """
         self.path = path
         self.index = index_frames(path) if index is None else index
         self._number = {int(stamp): number for number, stamp in enumerate(self.index.stamps)}
@@ -272,8 +280,14 @@ class VideoReader(Pictures):
         """Yield frames as `frames` does, with None for each damaged or undecodable one.
 
         Frames after a damaged one up to the next key frame are None too: they may be predicted from
-        it. RGB images get the width [px], before rotation. Frames that are not in `only` are
-        decoded, but not converted and yielded.
+        it.
+
+        Args:
+            start: first frame.
+            stop: one past the last; the end of the video if None.
+            grey: luma instead of RGB.
+            width: RGB images get this width, before rotation [px]; None = unscaled.
+            only: frames to yield; the others are decoded, but not converted. None = all.
 
         Raises:
             InputError: there are no such frames, or one has another size than the first.
@@ -398,11 +412,15 @@ class VideoReader(Pictures):
 
 
 def write_video(path: Path, pictures: Iterable[Image], fps: float, *, quality: int = 20) -> int:
-    """Write images to an .mp4 file and return their number; the same images give the same bytes.
+    """Write images to a file and return their number; the same images give the same bytes.
 
     H.264 with a key frame per second if the installed FFmpeg can write it, else MPEG-4 part 2.
-    Images are (height, width, 3) RGB, or (height, width) grey, all of one even size. Quality 0 is
-    without loss, 51 the worst (H.264's constant rate factor).
+
+    Args:
+        path: .mp4, written image by image.
+        pictures: (height, width, 3) RGB, or (height, width) grey, all of one even size.
+        fps: frames per second.
+        quality: 0 is without loss, 51 the worst (H.264's constant rate factor).
 
     Raises:
         InputError: no image, or one of another or an odd size.

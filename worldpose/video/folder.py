@@ -26,10 +26,15 @@ MAX_PIXELS: Final = 200_000_000
 
 
 def decode_image(content: Image, *, grey: bool = False, turned: bool = True) -> Image | None:
-    """Return an image (height, width, 3) RGB, or (height, width) grey, of the bytes of a file.
+    """Return an image (height, width, 3) RGB, or (height, width) grey.
 
-    It is `turned` as its EXIF tag says that it is shown, or as it is stored. None if the bytes are
-    no whole image of `FORMATS`, or declare more than `MAX_PIXELS`.
+    Args:
+        content: (bytes,) content of an image file of `FORMATS`.
+        grey: without colour.
+        turned: as its EXIF tag says that it is shown, not as it is stored.
+
+    Returns:
+        None if the bytes are no whole image, or declare more than `MAX_PIXELS`.
     """
     import cv2  # late: it takes 0.2 s, and few commands open an image
 
@@ -70,7 +75,15 @@ class ImageFolder(Pictures):
     """Images whose names end in their number; the lowest is frame 0, a gap a missing frame."""
 
     def __init__(self, folder: Path, index: FrameIndex | None = None) -> None:
-        """Open a folder, whose index is computed if it is None; see `numbered_images`."""
+        """Open a folder.
+
+        Args:
+            folder: holds the images.
+            index: index of the images; if None, it is computed.
+
+        Raises:
+            InputError: no images, or names without a number or with the same one.
+        """
         self.path = folder
         self._files = [file for _, file in numbered_images(folder)]
         self.index = index_images(folder) if index is None else index
@@ -131,7 +144,11 @@ def numbered_images(folder: Path) -> list[tuple[int, Path]]:
 
 
 def index_images(folder: Path) -> FrameIndex:
-    """Return the index of `numbered_images` of a folder; the size is that of the first one."""
+    """Return the index of a folder of images; the size comes from the first one.
+
+    Raises:
+        InputError: no images, or names without a number or with the same one.
+    """
     images = numbered_images(folder)
     stamps = np.array([number for number, _ in images], dtype=np.int64)
     first = _read(images[0][1], grey=True)
@@ -165,7 +182,12 @@ def _read(file: Path, *, grey: bool) -> Image | None:
 def some_pictures(
     video: VideoReader | ImageFolder, numbers: NDArray[np.integer]
 ) -> Iterator[tuple[int, Image | None]]:
-    """Yield selected frames, of rising numbers (pictures,); None where one cannot be decoded."""
+    """Yield selected frames in order; None where one cannot be decoded.
+
+    Args:
+        video: their source.
+        numbers: (pictures,) rising.
+    """
     for group in jumps(numbers, video.index.key):
         only = set(group.tolist())
         yield from video.readable(int(group[0]), int(group[-1]) + 1, only=only)
@@ -187,7 +209,10 @@ def readable_at(
 ) -> Iterator[Image | None]:
     """Yield the frame of each number; None for a negative one, and where none can be decoded.
 
-    Numbers (pictures,) may repeat; decoding begins again where they go back.
+    Args:
+        video: their source.
+        numbers: (pictures,) with repetitions; decoding begins again where they go back.
+        grey: as of `Pictures.frames`.
     """
     only = set(numbers.tolist())
     end = max(only, default=0) + 1
@@ -212,8 +237,9 @@ def grey_on_clock(path: Path, numbers: Integers, fps: float) -> Iterator[Image]:
 def jumps(numbers: NDArray[np.integer], key: Flags) -> list[NDArray[np.integer]]:
     """Return groups of frames, each decoded in one pass.
 
-    `numbers` (pictures,) are selected, rising; `key` (all pictures,) are frames where decoding can
-    begin.
+    Args:
+        numbers: (pictures,) selected, rising.
+        key: (all pictures,) whether decoding can begin there.
     """
     if not len(numbers):
         return []
@@ -228,8 +254,11 @@ def median_picture(frames: Iterable[Image], most: int = 64) -> Image:
     """Return the median of a clip's frames, which shows no moving people.
 
     At most `most` frames are in memory, evenly spread over the clip: when the limit is reached, the
-    function drops every second frame and doubles the stride. Frames are (height, width) or (height,
-    width, 3), of one camera that does not move.
+    function drops every second frame and doubles the stride.
+
+    Args:
+        frames: (height, width) or (height, width, 3) each, of one camera that does not move.
+        most: maximum number of frames in memory, two or more.
 
     Raises:
         InputError: there are no frames, their sizes differ, or `most` is below two.

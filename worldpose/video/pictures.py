@@ -160,9 +160,12 @@ class Pictures(ABC):
     def frames(
         self, start: int = 0, stop: int | None = None, *, grey: bool = False
     ) -> Iterator[tuple[int, Image]]:
-        """Yield frame numbers from `start` up to before `stop`, or the end, each with its image.
+        """Yield frame numbers from `start` up to before `stop`, each with its image.
 
-        Grey is luma (height, width) as stored, in half the time, instead of RGB.
+        Args:
+            start: first frame.
+            stop: one past the last; the end of the video if None.
+            grey: luma (height, width) as stored, in half the time, instead of RGB.
 
         Raises:
             InputError: there are no such frames, or one cannot be decoded.

@@ -58,11 +58,19 @@ def join_videos(parts: Sequence[Path], out: Path) -> None:
 
 
 def cut_video(path: Path, start: int, stop: int, out: Path) -> int:
-    """Write frames `start` up to before `stop` of a video into a file of the same kind, as encoded.
+    """Write a range of frames of a video without re-encoding.
 
     Decoding begins at key frames: the file also holds some frames before the first one wanted, and
-    perhaps some after the last one, from which others are predicted. The function returns the
-    number of frame `start` in the new file.
+    perhaps some after the last one, from which others are predicted.
+
+    Args:
+        path: the video.
+        start: number of the first frame.
+        stop: one past the last.
+        out: the file to write, of the same kind.
+
+    Returns:
+        The number of frame `start` in the new file.
 
     Raises:
         InputError: no video, or it has no such frames.

@@ -34,9 +34,14 @@ class ContentError(ValueError):
 def decode_file(
     path: Path, limit: int, decode: Callable[[bytes], Content], expected: str, todo: str
 ) -> Content:
-    """Return what `decode` makes of a file of at most `limit` bytes.
+    """Return what `decode` makes of a file.
 
-    `decode` raises ContentError or pydantic's error for a bad content; the texts are for messages.
+    Args:
+        path: the file.
+        limit: maximum size [byte].
+        decode: raises ContentError or pydantic's error for a bad content.
+        expected: what the file should be, for messages.
+        todo: what to do about another file, for messages.
 
     Raises:
         InputError: the file is unreadable, too large, or invalid.
@@ -100,7 +105,11 @@ class AnnotatedImage:
 
 
 def hull(keypoints: Floats) -> Floats:
-    """Return the box (4,) around keypoints (17, 2) [px], at least one of which is not NaN."""
+    """Return the box (4,) around a person's keypoints [px], for a person without a box.
+
+    Args:
+        keypoints: (17, 2) [px], at least one of them not NaN.
+    """
     there = keypoints[np.isfinite(keypoints).all(axis=1)]
     return np.concatenate([there.min(axis=0), there.max(axis=0)])
 

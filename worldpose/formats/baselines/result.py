@@ -28,11 +28,17 @@ from worldpose.pickles import read_pickle
 def write_tracks(
     path: Path, boxes: NDArray[np.float64], ids: NDArray[np.int64], number: NDArray[np.integer]
 ) -> None:
-    """Write boxes (frames, persons, 4) x0 y0 x1 y1 [px], NaN where absent, as a MOTChallenge text.
+    """Write boxes as a MOTChallenge text, whole or not at all.
 
-    One line for each person and image: image from 1, id from 1, left, top, width, height [px] and
+    One line for each person and image: image from 1, id, left, top, width, height [px] and
     confidence 1, then three times -1. In that format, (1, 1) is the top-left corner of the top-left
-    pixel. `number` (frames,) is that of each frame's image in its video, from 0.
+    pixel.
+
+    Args:
+        path: the file.
+        boxes: (frames, persons, 4) x0 y0 x1 y1 [px]; NaN if a person is not in the image.
+        ids: (persons,), renumbered from 1.
+        number: (frames,) number of each frame's image in its video, from 0.
     """
     frames, people = np.nonzero(np.isfinite(boxes).all(-1))
     found = boxes[frames, people]
@@ -47,15 +53,22 @@ def write_tracks(
 
 
 def write_slahmr_cameras(path: Path, camera: Camera) -> None:
-    """Write a camera (frames,) as `cameras.npz`, as SLAHMR's variant with true cameras reads it.
+    """Write `cameras.npz` as SLAHMR reads it, for its variant with true cameras.
 
     Members: `height`, `width`, `focal` [px], `intrins` (frames, 4) fx fy cx cy [px] and `w2c`
     (frames, 4, 4), in world axes with y down: x as in the world, z along the world's y. The method
-    has no distortion model. Layout: vye16/slahmr at commit 58518fe, slahmr/data/dataset.py
-    (`load_cameras_npz`).
+    has no distortion model.
+
+    Args:
+        path: the file.
+        camera: (frames,).
 
     Raises:
         InputError: a frame has no camera.
+
+    Note:
+        Layout as read by vye16/slahmr at commit 58518fe, slahmr/data/dataset.py
+        (`load_cameras_npz`).
     """
     missing = np.flatnonzero(np.isnan(camera.numbers).any(-1))
     if len(missing):
@@ -226,8 +239,10 @@ def merge_people(
 def project_boxes(joints: Floats, focal: Floats, center: Floats) -> Floats:
     """Return boxes (frames, 4) x0 y0 x1 y1 [px] around one person's joints in an image.
 
-    Joints (frames, 17, 3) [m] are in camera axes; those behind the camera are ignored. Focal
-    lengths and principal points [px] are (2,) or (frames, 2).
+    Args:
+        joints: (frames, 17, 3) [m], camera axes; those behind the camera are ignored.
+        focal: (2,) or (frames, 2) [px].
+        center: (2,) or (frames, 2) principal point [px].
     """
     ahead = joints[..., 2:] > 0.0
     depth = np.where(ahead, joints[..., 2:], np.nan)
@@ -246,10 +261,15 @@ def boxes_around(pixels: Floats) -> Floats:
 
 
 def resample_result(result: MethodResult, seen_fps: float, fps: float) -> MethodResult:
-    """Return a result at its clip's `fps`, with linear interpolation of joints and boxes.
+    """Return a result at its clip's frames, with linear interpolation of joints and boxes.
 
-    Its frames count the method's input images, `seen_fps` a second. The first images of both are
-    simultaneous. If either of the two images around a frame lacks a person, the frame does, too.
+    The first images of both are simultaneous. If either of the two images around a frame
+    lacks a person, the frame lacks the person, too.
+
+    Args:
+        result: its frames count the images of the method's input.
+        seen_fps: frame rate of those images [1/s].
+        fps: frame rate of the clip [1/s].
     """
     if seen_fps == fps or not len(result.joints.frames):
         return result
