@@ -82,14 +82,14 @@ def test_a_triangulation_setting_leaves_tracking_alone(tiny, stricter_copy):
 
     # Back to the defaults: all results are there, so a new run is recorded without any task.
     defaults = (tiny, "--project", stricter_copy, "--default-settings")
-    back = run_json(*defaults)
+    back = run_json(*defaults, environment=NO_ORCHESTRATOR)
     assert (back["run"], back["executed"]) == ("0003", 0)
     store = Store.open(str(stricter_copy))
     assert store.run(TINY, "0003").results == store.run(TINY, "0001").results
 
 
 def test_every_way_to_start_a_run_keeps_the_settings_of_the_latest(tiny, stricter_copy):
-    again = succeed("run", tiny, "--project", stricter_copy)
+    again = succeed("run", tiny, "--project", stricter_copy, environment=NO_ORCHESTRATOR)
     assert "settings: triangulation.min_views=3 (match); see worldpose settings" in again.err
     store = Store.open(str(stricter_copy))
     match, plain = open_match(store, TINY), RunRequest({})
@@ -125,7 +125,7 @@ def test_a_run_finds_an_installed_body_and_keeps_it(tiny, project_copy, tmp_path
     again = run_json(*asked, environment={**NO_ORCHESTRATOR, **where})
     assert (again["run"], again["executed"]) == (answer["run"], 0)
     # The match has kept both: a run in another shell, without the variable, has the same body.
-    again = run_json(*asked)
+    again = run_json(*asked, environment=NO_ORCHESTRATOR)
     assert (again["run"], again["executed"]) == (answer["run"], 0)
     bodies = open_run(project_copy, TINY).bodies("clip")
     assert open_run(project_copy, TINY)["body_fitting/clip"].attrs["body_model"] == "smpl-neutral"
