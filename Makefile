@@ -18,7 +18,7 @@ IMPORTS = $(BIN)/python -c 'import flows.reports.report, flows.results.evaluatio
 # Where it is set, each of the hundreds of processes of the tests would compile all sources again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: install develop demo demo-quick demo-match real-demo check format test test-all docs schemas pages size clean
+.PHONY: install develop demo demo-quick demo-match real-demo check style format test test-all docs schemas pages size clean
 
 # What the commands need. What checks, tests and the documentation need besides is added before the first of them.
 install: $(INSTALLED)
@@ -74,23 +74,27 @@ real-demo: install
 	@echo "3/3  what it found"
 	@$(BIN)/python infra/real_demo/score.py real-demo/match real-demo/project real-demo/overlay.mp4
 
-check: develop
+check: style
+	$(BIN)/mypy
+
+style: develop
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
 
 format: develop
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
 # Processes begin with neighbouring tests, which share what they made, and take over the rest of others.
-PYTEST := $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist worksteal
+# Types are checked at the same time: a minute of one core, while some tests only wait.
+PYTEST = $(BIN)/mypy & types=$$!; trap "kill $$types" INT TERM; \
+  $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist worksteal $(1); tests=$$?; wait $$types && exit $$tests
 
-test: develop check
-	$(PYTEST) -m "not slow"
+test: style
+	@$(call PYTEST,-m "not slow")
 
-test-all: develop check
-	$(PYTEST)
+test-all: style
+	@$(call PYTEST)
 
 # The site of the documentation, at build/docs/index.html; a warning is an error.
 docs: develop

@@ -24,7 +24,7 @@ from flows.orchestration.prefect_environment import local_cluster_options, prefe
 multiprocessing.util.get_temp_dir()
 
 # How long a case takes says how busy a machine is.
-settings.register_profile("untimed", deadline=None)
+settings.register_profile("untimed", deadline=None, max_examples=50)
 settings.load_profile("untimed")
 
 

@@ -103,15 +103,12 @@ def test_only_one_module_reads_npy_arrays():
     assert users == {"worldpose/parsing.py"}
 
 
-@pytest.mark.parametrize(
-    "package", ["worldpose", "worldpose.tracking.tracker", "worldpose.store.store"]
-)
-def test_the_library_imports_without_orchestrators(package):
+def test_the_library_imports_without_orchestrators():
     script = (
         "import sys\n"
         "for name in ('prefect', 'dask', 'distributed', 'torch', 'obstore'):\n"
         "    sys.modules[name] = None\n"
-        f"import {package}\n"
+        "import worldpose, worldpose.tracking.tracker, worldpose.store.store\n"
     )
     subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT)
 
@@ -168,20 +165,12 @@ def test_no_modules_import_each_other_in_a_circle():
 HEAVY = ("numba", "scipy", "cv2", "av", "zarr", "xarray", "torch", "pandas", "matplotlib")
 
 
-@pytest.mark.parametrize("name", ["tracking", "body_fitting", "bundle_adjustment", "ingest"])
-def test_the_settings_and_readers_of_a_stage_import_no_estimator(name):
-    module = "worldpose.ingest.match_folder" if name == "ingest" else f"worldpose.{name}.settings"
-    assert heavy_imports_of(module) == []
-
-
-def test_a_run_is_planned_without_an_estimator():
-    # Prefect's server and the workers start after that.
-    assert heavy_imports_of("flows.cli.run, flows.registering, flows.running") == []
-
-
-def heavy_imports_of(modules):
-    """Heavy modules that a process has after importing these."""
+def test_settings_and_readers_of_stages_and_the_plan_of_a_run_import_no_estimator():
+    stages = ("tracking", "body_fitting", "bundle_adjustment")
+    modules = ", ".join(f"worldpose.{name}.settings" for name in stages)
+    modules += ", worldpose.ingest.match_folder"
+    # Prefect's server and the workers start after these.
+    modules += ", flows.cli.run, flows.registering, flows.running"
     script = f"import sys, {modules}; print(*sorted({set(HEAVY)} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.split()
+    assert (done.returncode, done.stdout.split()) == (0, []), done.stderr

@@ -37,14 +37,8 @@ def assert_same_store(project, undisturbed):
     assert problems_of(project, undisturbed) == []
 
 
-def quick(points, kept):
-    """All points, but only some of them in the quick tier."""
-    return [
-        point if point in kept else pytest.param(point, marks=pytest.mark.slow) for point in points
-    ]
-
-
-@pytest.mark.parametrize("point", quick(IN_WORKER, {"before_commit"}))
+@pytest.mark.slow
+@pytest.mark.parametrize("point", IN_WORKER)
 def test_a_worker_killed_at_a_commit_point_is_replaced(point, tiny, tiny_run, tmp_path):
     # Two workers share more than a dozen units, so one of them comes to the point a third time.
     environment, struck = fault_environment(tmp_path, point, skip=2)

@@ -10,7 +10,6 @@ from page_client import MATCH
 
 from data_contracts.match import PlayerSpec
 from data_contracts.review import (
-    AddedDetection,
     Correction,
     DeletedDetection,
     MergedTracks,
@@ -20,8 +19,7 @@ from data_contracts.review import (
 )
 from flows.registering import open_match
 from flows.results.best_results import clip_positions
-from flows.review.corrections import keep_edits, objections_now, objections_of
-from flows.review.detections import detections_now
+from flows.review.corrections import keep_edits, objections_of
 from flows.review.edit_conflicts import StaleEditError
 from flows.review.identities import identities_now, lost_names, names_of
 from flows.review.verdicts import correct, origins_of, withdraw
@@ -185,51 +183,6 @@ def test_names_of_the_match_folder_are_those_of_people_until_a_page_gives_others
     say(store, b=NamedTrack(clip="clip", person=other, name=None))
     assert names_of(run, "clip") == {one: "Ann"}
     assert identities_now(store, open_match(store, TINY), "clip").identities.names[one] == "Ann"
-
-
-def test_names_of_the_match_folder_are_of_the_people_after_merges_and_in_no_other_run(store):
-    found = identities_now(store, open_match(store, TINY), "clip").identities
-    (one, other), new = found.person.tolist()[:2], int(found.person.max()) + 1
-
-    def names_now():
-        match = open_match(store, TINY)  # which reads match.yaml again
-        state(store, {one: "ann", other: "bea", new: "dora"})
-        return identities_now(store, match, "clip").identities.names
-
-    middle = int(found.frame[len(found.frame) // 2])
-    say(store, a=SplitTrack(clip="clip", person=one, first_frame_of_new=middle))
-    say(store, b=NamedTrack(clip="clip", person=new, name="Bob"))
-    say(store, c=MergedTracks(clip="clip", kept=one, merged=new))
-    assert names_now() == {one: "Bob", other: "bea"}
-    say(store, d=SplitTrack(clip="clip", person=one, first_frame_of_new=middle + 1))
-    record, unit = store.run(TINY), planned(store)
-    compute(store, unit)
-    results = {**record.results, "tracking/clip": unit.key}
-    run = Run(store, record.model_copy(update={"results": results}))
-    assert names_now() == {one: "Bob", other: "bea"}  # a merge removed Dora's id
-    assert names_of(run, "clip") == {one: "Bob"}
-    assert "this run has other tracks" in lost_names(run)["clip"]
-
-
-def test_a_correction_that_the_withdrawal_of_another_ends_is_told_before_the_next_run(store):
-    def objections():
-        return objections_now(store, open_match(store, TINY), latest_run(store, TINY))
-
-    found = identities_now(store, open_match(store, TINY), "clip").identities
-    new, (first, *_, last) = int(found.person.max()) + 1, found.frame.tolist()
-    middle = (first + last) // 2
-    say(store, a=SplitTrack(clip="clip", person=0, first_frame_of_new=middle))
-    say(store, b=SplitTrack(clip="clip", person=new, first_frame_of_new=middle + 5))
-    free = detections_now(store, open_match(store, TINY), "cam01", first).score.shape[1]
-    at = {"camera": "cam01", "frame": first, "detection": free}
-    say(store, c=AddedDetection(**at, box=(1.0, 2.0, 30.0, 40.0)))
-    say(store, d=DeletedDetection(**at), e=DeletedDetection(**at | {"detection": 0}))
-    assert objections() == {}
-    withdraw(store, open_match(store, TINY), ["a", "c"], who="Ada", why="")
-    assert objections() == {
-        "b": f"clip clip has no person {new}",
-        "d": f"there is no detection {free} of cam01 in frame {first}",
-    }
 
 
 def test_every_door_refuses_what_does_not_fit_the_results(store):

@@ -148,6 +148,7 @@ def test_a_camera_with_clicks_of_the_other_end_is_named_and_left_out(tiny, tmp_p
     assert run.record.figures["tracking/clip"]["unmatched_share"] < 0.1
 
 
+@pytest.mark.slow
 def test_a_camera_without_clicks_has_its_place_in_the_report(tiny, tmp_path):
     folder, project = shutil.copytree(tiny, tmp_path / "match"), ("--project", tmp_path / "project")
     (folder / "annotations" / "static_calibration" / "cam00.json").unlink()
@@ -222,6 +223,7 @@ def test_the_end_of_a_partial_run_says_what_is_missing(project_copy, monkeypatch
     assert (state["code"], state["lines"]) == (4, [text])
 
 
+@pytest.mark.slow
 def test_one_camera_gives_positions_on_the_pitch_with_their_uncertainty(server, tmp_path):
     one = ("--scenario", "match", "--seed", 5, "--duration", 1, "--no-stills", "--cameras", 1)
     succeed("simulate", *one, "--out", tmp_path / "one")

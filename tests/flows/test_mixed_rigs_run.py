@@ -40,7 +40,12 @@ RIGS = {
 }
 
 
-@pytest.mark.parametrize("name", RIGS)
+SLOW = {"two halves of a pitch", "face to face"}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in RIGS]
+)
 def test_cameras_of_a_mixed_rig_are_right_and_their_people_in_their_regions(
     server, tiny, tmp_path, name
 ):
@@ -188,6 +193,7 @@ def test_a_knocked_camera_is_named_corrected_and_labelled_where_it_looks(importe
         assert apart.mean(axis=-1).min(axis=1).max() < 3.0
 
 
+@pytest.mark.slow
 def test_a_zoom_is_told_and_hides_no_knock_of_another_camera(imported, clip_joints):
     match = imported(
         lambda pixels: np.concatenate([pixels[:60], 1.2 * (pixels[60:] - MIDDLE) + MIDDLE]),
@@ -198,6 +204,7 @@ def test_a_zoom_is_told_and_hides_no_knock_of_another_camera(imported, clip_join
     assert "camera cam0 moves at frame 90" in said
 
 
+@pytest.mark.slow
 def test_lost_frames_are_named_and_synchronized(imported, clip_joints):
     match = imported(lambda pixels: np.concatenate([pixels[:60], pixels[64:]]))
     said, error = run_to_triangulation(match, clip_joints)

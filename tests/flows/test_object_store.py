@@ -2,6 +2,7 @@
 
 import uuid
 
+import pytest
 from command_line import TINY, succeed
 from store_comparison import compare_stores
 
@@ -13,6 +14,7 @@ from worldpose.store.integrity import verify
 from worldpose.store.store import Store
 
 
+@pytest.mark.slow
 def test_a_match_run_on_object_storage_equals_one_on_disk(server, bucket, tiny, tiny_run):
     project = f"{bucket}/{uuid.uuid4().hex}"
     succeed("run", tiny, "--project", project)

@@ -52,13 +52,13 @@ def test_an_embedded_run_reaches_nothing_but_this_machine(no_server, tiny, tmp_p
     assert "192.0.2.1" in notes.read_text(), "the guard does not work"
     notes.unlink()
     project = tmp_path / "worldpose-data"
-    joints = ("--until", "triangulation")
-    succeed("run", tiny, "--project", project, *joints, environment=environment)
+    part = ("--until", "ingest")
+    succeed("run", tiny, "--project", project, *part, environment=environment)
     assert not notes.exists(), notes.read_text()
 
 
 def test_a_run_is_visible_at_the_server_by_name(server, tiny, tmp_path):
-    succeed("run", tiny, "--project", tmp_path / "worldpose-data", "--until", "triangulation")
+    succeed("run", tiny, "--project", tmp_path / "worldpose-data", "--until", "ingest")
 
     def ask(kind):
         request = urllib.request.Request(
@@ -76,7 +76,7 @@ def test_a_run_is_visible_at_the_server_by_name(server, tiny, tmp_path):
     assert (run["name"], run["state_name"]) == (TINY, "Completed")
     assert run["parameters"]["match_id"] == TINY
     tasks = {task["name"] for task in ask("task_runs") if task["flow_run_id"] == run["id"]}
-    assert {"tracking clip", "triangulation clip"} <= tasks
+    assert any(name.startswith("ingest") for name in tasks)
 
 
 @pytest.mark.slow
@@ -154,11 +154,11 @@ def test_a_worker_that_is_gone_for_good_is_begun_anew(monkeypatch):
 
 
 def test_workers_that_cannot_import_their_modules_are_told(monkeypatch):
-    monkeypatch.setattr(local_cluster, "START_SECONDS", 5.0)
+    monkeypatch.setattr(local_cluster, "START_SECONDS", 2.0)
     with (
         dask.config.set({"distributed.worker.preload": ["no_such_module"]}),
         closing(local_cluster.start_cluster(1, [])) as cluster,
-        pytest.raises(WorldposeError, match="No worker process started within 5 s"),
+        pytest.raises(WorldposeError, match="No worker process started within 2 s"),
     ):
         local_cluster.wait_for_worker(cluster)
 

@@ -330,24 +330,6 @@ def test_files_named_by_the_first_word_of_a_camera_are_its_own(place, footage):
     assert "Rename the label" in problem["message"]
 
 
-def test_frames_of_an_uploaded_video_are_shown(place, footage):
-    ada = open_pages(place)
-    draft, view = upload(ada, footage)
-    path = f"{DRAFTS}/{draft}/files/{view['files'][0]['id']}/frames"
-    shown = {}
-    for number in (0, FRAMES - 1):
-        answer = ada.get(f"{path}/{number}?fps={FPS}")
-        assert answer.headers["content-type"] == "image/jpeg"
-        shown[number] = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR)
-        assert shown[number].shape == (SIZE[1], SIZE[0], 3)
-    # Each frame of the video is brighter by 5 than the one before.
-    change = shown[FRAMES - 1].mean() - shown[0].mean()
-    assert change == pytest.approx(5 * (FRAMES - 1), abs=6)
-    for number in (FRAMES, -1):
-        assert ada.get(f"{path}/{number}?fps={FPS}").status_code == 422
-    assert page_client.browser(ada.app).get(f"{path}/0?fps={FPS}").status_code == 401
-
-
 def test_frames_are_counted_by_the_clock_of_the_camera(place, tmp_path):
     """A recorder left out frames 4 to 7: frame 9 stays frame 9, and 5 shows the nearest image."""
     file, levels = tmp_path / "camera.mp4", [0, 1, 2, 3, *range(8, 12)]

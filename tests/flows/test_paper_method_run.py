@@ -34,6 +34,7 @@ def smpl_file(tmp_path):
     return tmp_path / "SMPL_NEUTRAL.npz", arrays
 
 
+@pytest.mark.slow  # unit/reference_method has its stages
 @pytest.mark.timeout(900)
 def test_the_paper_s_method_fits_an_installed_body_whose_joints_are_those_of_smplx(
     tiny, tmp_path, smpl_file

@@ -146,7 +146,7 @@ def test_ctrl_c_says_what_is_kept_and_leaves_neither_warning_nor_traceback(serve
     found = [path.parent.name for path in (tmp_path / "project").rglob("manifest.json")]
     assert len(found) >= kept >= 1
     assert "working" not in last and "Traceback" not in text and "leaked" not in text
-    succeed("run", tiny, "--project", tmp_path / "project", "--until", "tracking")
+    succeed("run", tiny, "--project", tmp_path / "project", "--until", "ingest")
 
 
 def test_pages_read_what_the_command_line_prints(clock, monkeypatch):

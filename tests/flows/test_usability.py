@@ -106,11 +106,13 @@ def test_a_limit_is_a_setting_and_is_kept_with_the_verdict():
 def test_warnings_of_stages_that_doubt_their_results_are_reservations_those_of_inputs_are_not():
     said = {
         "ingest/cam1": ["cam1: 25 fps"],
+        "detection/cam2.clip": ["cam2.clip: the camera does not film this clip."],
+        "detection/cam1.clip": ["cam1.clip: people are 833 px tall in the images."],
         "triangulation/clip": ["camera cam2 moves."],
         "broadcast_calibration/clip": ["3 frames have no evidence."],
         "broadcast_tracking/clip": ["found no person on the pitch."],
     }
-    doubts = [text for texts in [*said.values()][1:] for text in texts]
+    doubts = [text for texts in [*said.values()][2:] for text in texts]
     assert judge("x/y", warnings=said).reservations == tuple(doubts)
 
 
@@ -131,6 +133,7 @@ def test_failed_units_and_cameras_left_out_are_reservations():
         ({"lacks_people": True}, "no person is placed."),
         ({"waiting": 2}, "results that wait for review: 2."),
         ({"unit": "tracking/clip", "figures": {"absent_share": 0.6}}, "people are missing in"),
+        ({"unit": "tracking/clip", "figures": {"unmatched_share": 0.63}}, "no track follows more"),
     ],
 )
 def test_results_that_are_not_there_are_not_usable(outcome, said):
@@ -145,18 +148,3 @@ def test_people_who_are_not_in_3d_are_places_that_can_be_used():
     assert found.verdict == "usable with reservations"
     assert found.reservations[0].startswith("no person is in 3D: people have places on the pitch")
     assert "could not be computed" not in str(found.reservations)  # there are no joints to judge
-
-
-def test_people_whom_the_nets_do_not_know_are_a_reservation_and_a_clip_not_filmed_is_none():
-    warnings = {
-        "detection/cam1.clip": ["cam1.clip: people are 833 px tall in the images."],
-        "detection/cam2.clip": ["cam2.clip: the camera does not film this clip."],
-    }
-    found = judge_run(RunOutcome(warnings=warnings), UsableLimits())
-    assert found.reservations == ("cam1.clip: people are 833 px tall in the images.",)
-
-
-def test_results_are_not_usable_where_most_detections_belong_to_nobody():
-    found = judge("tracking/clip", figures={"unmatched_share": 0.63})
-    assert found.verdict == "not usable"
-    assert found.reservations[0].startswith("no track follows more than 50 % of the people")

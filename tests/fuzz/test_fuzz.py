@@ -17,7 +17,7 @@ from worldpose.errors import InputError, InternalError
 from worldpose.store.store import Store
 
 
-@pytest.mark.parametrize("cases", [20, pytest.param(48, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("cases", [8, pytest.param(48, marks=pytest.mark.slow)])
 def test_a_sample_of_cases_ends_without_a_defect(tmp_path, cases):
     """Longer: python -m tests.fuzz --cases 5000 --seed S --out DIR."""
     command = [sys.executable, "-m", "tests.fuzz", "--seed", "1", "--cases", str(cases)]

@@ -62,6 +62,7 @@ def test_the_stated_error_covers_the_lines_that_miss(bench, found):
     assert (std > [0.1, 0.1, 0.05]).all()
 
 
+@pytest.mark.slow
 @needs_clip
 def test_the_clip_alone_gives_a_camera_and_people_on_the_pitch(bench, tmp_path):
     match, project = tmp_path / "match", ("--project", tmp_path / "project")

@@ -50,6 +50,7 @@ def test_the_camera_of_the_other_markings_predicts_one():
     assert hits[1] >= 87.5
 
 
+@pytest.mark.slow
 def test_distortion_free_cameras_overlap_the_annotated_homographies():
     lines = load_lines(DATA, "wc14", half=1, every=1)
     _, size = SETS["wc14"]

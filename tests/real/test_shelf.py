@@ -19,6 +19,7 @@ SHELF = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent")) / "shelf_dev"
 pytestmark = [
     pytest.mark.skipif(not SHELF.is_dir(), reason="WORLDPOSE_TEST_DATA has no shelf_dev"),
     pytest.mark.usefixtures("server"),
+    pytest.mark.slow,  # 60 of its frames are in test_shelf_cameras.py
 ]
 
 

@@ -39,7 +39,7 @@ def test_labels_name_markings_and_lie_in_their_images(bench):
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="WORLDPOSE_TEST_DATA has no still_cameras")
-@pytest.mark.parametrize("name", [MIDFIELD, AREA])
+@pytest.mark.parametrize("name", [MIDFIELD, pytest.param(AREA, marks=pytest.mark.slow)])
 def test_a_real_still_is_calibrated_without_a_click(bench, name):
     (still,) = bench.read_labels(only=[name])
     picture = cv2.imread(str(DATA / f"{name}.png"))

@@ -55,6 +55,7 @@ def test_the_fisheye_follows_the_real_lens_within_half_a_pixel(lens):
     assert off[radius > 0.08].max() < 0.5
 
 
+@pytest.mark.slow
 def test_calibration_without_clicks_places_feet_or_is_refused(lens):
     camera = lens[0]
     pose = -np.load(DATA / "camera_matrix.npy")[:3]

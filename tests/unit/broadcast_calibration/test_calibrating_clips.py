@@ -243,7 +243,7 @@ def test_camera_data_start_a_clip_without_clicks_and_are_compared(true, pictures
     assert not any("camera data" in reason for reason in found.report.reasons)
 
 
-@pytest.mark.parametrize("pan_off", [2.0, 4.0])
+@pytest.mark.parametrize("pan_off", [2.0, pytest.param(4.0, marks=pytest.mark.slow)])
 def test_paint_refuses_camera_data_of_another_view(true, pictures, pan_off):
     with pytest.raises(InputError, match=r"painted lines where the camera data project them"):
         calibrate_given(camera_data(true, pan_off, leads=True), pictures)

@@ -205,6 +205,7 @@ def test_people_bring_cameras_together(clip):
     assert all(reason.startswith("accepted") for reason in adjusted.reasons)
 
 
+@pytest.mark.slow
 def test_covariance_covers_the_error(clip):
     squared = []
     for seed in range(8):
@@ -312,7 +313,14 @@ def given(clip, cameras, **changes):
     )
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case",
+    [
+        "exact",
+        "large",
+        *(pytest.param(case, marks=pytest.mark.slow) for case in ("small", "focal")),
+    ],
+)
 def test_joints_are_never_worse_than_with_the_given_cameras(clip, case):
     made, true, joints = clip(cameras=4, frames=40, lasting=1.0, seed=3)
     turn, shift, focal = CASES[case]

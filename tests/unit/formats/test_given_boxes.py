@@ -98,12 +98,6 @@ def test_lines_without_an_id_are_refused(read):
             read(f"1,300,200,40,90,{score}\n2,305,200,40,90,{score}\n")
 
 
-def test_people_may_be_class_0_beside_others(read):
-    found = read("1,1,10,10,5,5,1,0\n1,2,30,10,5,5,1,32\n")
-    assert found.person.tolist() == [1]
-    assert found.changes == ("1 boxes of another class than 0, a person, which are left out",)
-
-
 def test_boxes_of_another_class_are_counted_and_minus_one_is_no_class(read):
     found = read("1,1,10,10,5,5,1,-1,-1\n1,2,30,10,5,5,1,1,1\n1,3,50,10,5,5,1,7,1\n")
     assert found.person.tolist() == [1, 2]

@@ -303,13 +303,6 @@ def test_the_nine_numbers_and_the_size_of_a_camera_info_are_read(names, tmp_path
     assert lens.principal_point_px == pytest.approx((970.5, 530.5))
 
 
-def test_written_lenses_are_read_back_with_their_deviations(tmp_path):
-    lens = read_lenses(write_npz(tmp_path), "left", SIZES)
-    lens["left"] = lens["left"].model_copy(update={"focal_std_px": 3.25, "distortion_std": 0.001})
-    write_lens_toml(tmp_path / "lenses.toml", lens)
-    assert read_lens_toml(tmp_path / "lenses.toml", SIZES) == lens
-
-
 BAD = {
     "two matrices": (
         lambda folder: write_npz(folder) + write_npz_of(folder, 2.0 * MATRIX),

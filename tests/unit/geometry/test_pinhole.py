@@ -1,5 +1,7 @@
 """Projection through lenses and its inverse: pixels, derivatives and rays by OpenCV and by hand."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -274,32 +276,14 @@ def test_jacobians_equal_finite_differences(camera, seed):
     points = points[radius < 0.9 * fold_radius(camera.coefficients)]
     found = camera.project_with_jacobians(points)
 
-    def changed(**parts):
-        fields = ("focal", "principal_point", "distortion", "cam_from_world", "image_size")
-        return Camera(**{name: parts.get(name, getattr(camera, name)) for name in fields})
+    def turned(step):
+        pose = camera.cam_from_world.retract(step)
+        return replace(camera, cam_from_world=pose).project(points)
 
+    # Derivatives by the intrinsics and the lens are OpenCV's, see above.
     cases = [
         (found.d_points, lambda d: camera.project(points + d), 3, 1e-2),
-        (
-            found.d_pose,
-            lambda d: changed(cam_from_world=camera.cam_from_world.retract(d)).project(points),
-            6,
-            1e-4,
-        ),
-        (
-            found.d_intrinsics,
-            lambda d: changed(
-                focal=camera.focal + d[:2], principal_point=camera.principal_point + d[2:]
-            ).project(points),
-            4,
-            1.0,
-        ),
-        (
-            found.d_distortion[..., :5],
-            lambda d: changed(distortion=camera.coefficients + d).project(points),
-            5,
-            1e-4,
-        ),
+        (found.d_pose, turned, 6, 1e-4),
     ]
     for jacobian, function, size, step in cases:
         expected = central_differences(function, size, step)

@@ -143,12 +143,6 @@ def test_several_broadcast_cameras_need_static_ones(two):
         read_match(two)
 
 
-def test_an_offset_of_the_match_rate_is_rounded_and_its_rest_is_lateness():
-    spec = match("main", 12.25)
-    assert unit_frames(spec, "goal").offset == -88
-    assert image_clock(spec, "goal").late.tolist() == [-0.25] * 6
-
-
 CLICKED = ClickedMarkings(
     points=(
         ClickedPoint(name="corner_left_near", xy=(12.25, 900.5)),

@@ -28,7 +28,6 @@ from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BodyParameters
 from worldpose.dataset.benchmark import Sample
-from worldpose.errors import UsageError
 from worldpose.formats.joints_file import JointTracks
 from worldpose.formats.tables import Positions
 from worldpose.geometry.cameras import Camera
@@ -269,12 +268,6 @@ def printed(path, place=None):
         text=True,
         check=True,
     ).stdout
-
-
-def test_without_the_viewers_package_it_says_what_to_install(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(UsageError, match="with the extra rerun"):
-        write_recording(tmp_path / "clip.rrd", scene()[0], 50.0)
 
 
 SIZE = (322, 182)

@@ -151,7 +151,7 @@ def fisheye_views(rng, reach):
     return views
 
 
-@pytest.mark.parametrize("reach", [(0.9, 0.5), (1.6, 0.9)])
+@pytest.mark.parametrize("reach", [pytest.param((0.9, 0.5), marks=pytest.mark.slow), (1.6, 0.9)])
 def test_a_fisheye_is_chosen_and_found_within_its_stated_uncertainty(reach):
     fit = calibrate_lens("cam", fisheye_views(np.random.default_rng(1), reach), SIZE)
     lens = fit.lens

@@ -168,7 +168,12 @@ def test_a_camera_that_looks_straight_down_says_that_its_height_is_open(x):
 
 
 @pytest.mark.parametrize(
-    ("roll", "size"), [(90.0, people.SIZE), (-90.0, (1080, 1920)), (35.0, SIZE)]
+    ("roll", "size"),
+    [
+        (-90.0, (1080, 1920)),
+        pytest.param(90.0, SIZE, marks=pytest.mark.slow),
+        pytest.param(35.0, SIZE, marks=pytest.mark.slow),
+    ],
 )
 def test_a_rolled_camera_keeps_its_right_clicks_and_says_its_roll(roll, size):
     for seed in range(4):
@@ -379,7 +384,10 @@ def share_inside(scenario, clicks, cameras, *, stated, lines=False):
     return float(np.mean(inside))
 
 
-@pytest.mark.parametrize(("scenario", "clicks"), [("match", FEW), ("penalty-box", SPREAD_OUT)])
+@pytest.mark.parametrize(
+    ("scenario", "clicks"),
+    [("match", FEW), pytest.param("penalty-box", SPREAD_OUT, marks=pytest.mark.slow)],
+)
 def test_regions_contain_the_truth(scenario, clicks):
     # Of 32 cameras 95 % are inside give or take 3.9 %: three of those, and no lower.
     assert share_inside(scenario, clicks, 32, stated=clicks.noise_px) >= 0.83
