@@ -91,29 +91,24 @@ def simulate(
             recordings=recordings,
             calibrated=calibrated,
         )
-        _report_match(spec.match_id, out)
-        return
-    _refuse_options(f"scenario {scenario}", {"--recordings": recordings is not None})
-    with _show_rendering() as advance:
-        spec = simulate_match(
-            SCENARIOS[scenario],
-            seed,
-            out,
-            MatchOptions(
-                duration=duration,
-                cameras=cameras,
-                players=players,
-                trajectories=trajectories,
-                mocap=mocap,
-                calibrated=calibrated,
-                stills=stills,
-                video=video,
-                render=render,
-                masks=masks,
-            ),
-            advance=advance,
+    else:
+        _refuse_options(f"scenario {scenario}", {"--recordings": recordings is not None})
+        options = MatchOptions(
+            duration=duration,
+            cameras=cameras,
+            players=players,
+            trajectories=trajectories,
+            mocap=mocap,
+            calibrated=calibrated,
+            stills=stills,
+            video=video,
+            render=render,
+            masks=masks,
         )
-    _report_match(spec.match_id, out)
+        with _show_rendering() as advance:
+            spec = simulate_match(SCENARIOS[scenario], seed, out, options, advance=advance)
+    about = {"match": spec.match_id, "folder": str(out)}
+    answer(about, f"made match {spec.match_id} in {out}")
 
 
 def _refuse_options(what: str, options: dict[str, bool]) -> None:
@@ -126,12 +121,6 @@ def _refuse_options(what: str, options: dict[str, bool]) -> None:
                 found=f"{option}, which it does not have",
                 todo="Omit the option; docs/explanation/simulation.md describes the alternatives.",
             )
-
-
-def _report_match(match_id: str, out: Path) -> None:
-    """Print the id of the created match."""
-    about = {"match": match_id, "folder": str(out)}
-    answer(about, f"made match {match_id} in {out}")
 
 
 @contextmanager

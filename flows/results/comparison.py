@@ -193,7 +193,6 @@ class BodiesOfBoth:
     """Bodies of one clip in two runs, in their common frames.
 
     Attributes:
-        clip: its id.
         frame: (frames,) match frames.
         person_before: (persons,) ids in A.
         person_after: (others,) ids in B.
