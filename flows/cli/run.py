@@ -216,9 +216,13 @@ def figures_of(iteration: Iteration) -> dict[str, float | None]:
     record = iteration.record
     judged = _total(record, "filtering", "judged")
     rejected = _total(record, "filtering", "keypoints_rejected")
-    reprojection = [
-        value for name, value in _last_bodies(record).items() if ".reprojection_px." in name
-    ]
+    bodies: dict[str, float] = {}
+    for stage in ("body_fitting", "refitting"):  # of refitted bodies if available
+        for unit, figures in record.figures.items():
+            if unit.startswith(f"{stage}/"):
+                clip = unit.partition("/")[2]
+                bodies |= {f"{clip}.{name}": value for name, value in figures.items()}
+    reprojection = [value for name, value in bodies.items() if ".reprojection_px." in name]
     return {
         "held_out_error": iteration.held_out_error,
         "rejected_share": rejected / judged if judged else None,
@@ -292,17 +296,6 @@ def _total(record: RunRecord, stage: str, name: str) -> float:
         for unit, figures in record.figures.items()
         if unit.startswith(f"{stage}/")
     )
-
-
-def _last_bodies(record: RunRecord) -> dict[str, float]:
-    """Return the body metrics of all clips as `unit.metric`, of refitted bodies if available."""
-    found: dict[str, float] = {}
-    for stage in ("body_fitting", "refitting"):
-        for unit, figures in record.figures.items():
-            if unit.startswith(f"{stage}/"):
-                clip = unit.partition("/")[2]
-                found |= {f"{clip}.{name}": value for name, value in figures.items()}
-    return found
 
 
 def reprocess(
