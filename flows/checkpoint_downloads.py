@@ -12,8 +12,7 @@ import os
 import re
 import shutil
 import zipfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 from urllib.parse import quote, urlsplit
@@ -40,11 +39,7 @@ Progress = Callable[[str, int, int], None]
 
 
 def read_catalog(file: Path | None) -> dict[str, Checkpoint]:
-    """Return the shipped checkpoints and those of a user's file, by name.
-
-    Raises:
-        InputError: the file is no catalog, or names a checkpoint twice or as a shipped one.
-    """
+    """Return the shipped checkpoints and those of a user's file, by name."""
     found: dict[str, Checkpoint] = {}
     for each in (SHIPPED, file) if file is not None else (SHIPPED,):
         for checkpoint in validate_record(CheckpointCatalog, read_yaml(each), str(each)).models:
@@ -75,32 +70,23 @@ def pull(checkpoint: Checkpoint, folder: Path, progress: Progress) -> Path:
     draft = folder / f".{checkpoint.name}.partial"
     files = draft / PULLED_FILES
     files.mkdir(parents=True, exist_ok=True)
-    with _only_process(draft / LOCK, checkpoint.name):
+    with (draft / "lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise WorldposeError(
+                f"{checkpoint.name}: another process is pulling this checkpoint. Wait for it."
+            ) from error
         for file in checkpoint.files:
             if _digest(files / file.name) != file.sha256:
                 _fetch_file(checkpoint.name, file, files / file.name, draft, progress)
         with whole_file(draft / PULLED_RECORD) as record:
             record.write_text(checkpoint.model_dump_json(indent=2) + "\n", encoding="utf-8")
-        (draft / LOCK).unlink()
+        (draft / "lock").unlink()
         if target.exists():
             shutil.rmtree(target)
         draft.rename(target)
     return target
-
-
-LOCK: Final = "lock"
-
-
-@contextmanager
-def _only_process(file: Path, name: str) -> Iterator[None]:
-    with file.open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise WorldposeError(
-                f"{name}: another process is pulling this checkpoint. Wait for it."
-            ) from error
-        yield
 
 
 def find_damage(folder: Path, checkpoint: Checkpoint) -> list[str]:

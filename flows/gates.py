@@ -29,10 +29,8 @@ class Gate:
 
     Attributes:
         stage: the stage that the gate follows, also the gate's name.
-        question: the decision for the reviewer.
         limits: the largest metrics that `auto` lets pass.
         judged: maps a result's metrics to those that are compared with the limits.
-        to_correct: what a person corrects after a rejection.
     """
 
     stage: str
@@ -55,7 +53,13 @@ class Gate:
             if name not in judged:
                 lines[name] = f"{name} could not be computed"
             elif exceeds(judged[name], limit):
-                lines[name] = _beyond(name, judged, limit)
+                parts = [
+                    key.removeprefix(f"{name}.")
+                    for key, value in judged.items()
+                    if key.startswith(f"{name}.") and exceeds(value, limit)
+                ]
+                named = f" ({', '.join(parts)})" if parts else ""
+                lines[name] = f"{name} is {judged[name]:.4g}{named}, at most {limit:.4g} passes"
         return lines
 
     def excess(self, figures: Figures) -> float:
@@ -77,17 +81,6 @@ def exceeds(value: float, limit: float) -> bool:
     return not float(f"{value:.4g}") <= float(f"{limit:.4g}")
 
 
-def _beyond(name: str, judged: Figures, limit: float) -> str:
-    """Return the line of a metric beyond its limit, with the parts `name.part` that are."""
-    parts = [
-        key.removeprefix(f"{name}.")
-        for key, value in judged.items()
-        if key.startswith(f"{name}.") and exceeds(value, limit)
-    ]
-    named = f" ({', '.join(parts)})" if parts else ""
-    return f"{name} is {judged[name]:.4g}{named}, at most {limit:.4g} passes"
-
-
 _CALIBRATION: Final = StaticCalibrationSettings()
 _USABLE: Final = UsableLimits()
 EXCESS: Final = "held_out_certain_excess_m"
@@ -100,11 +93,6 @@ def _in_3d(figures: Figures) -> Figures:
         return figures
     names = ("mean_ray_distance_m", "standard_deviation_m", "filled_share")
     return {**dict.fromkeys(names, 0.0), **figures}
-
-
-def _of_people(figures: Figures) -> Figures:
-    """Zero `bridged_share` with a stride: then boxes are interpolated on purpose."""
-    return {**figures, "bridged_share": 0.0} if figures.get("stride", 1) > 1 else figures
 
 
 def _of_adjustment(figures: Figures) -> Figures:
@@ -158,7 +146,8 @@ GATES: Final[Mapping[str, Gate]] = {
                 "flicker_share": 0.10,
             },
             "the people in this video, or the video itself",
-            _of_people,
+            # With a stride, boxes are interpolated on purpose.
+            lambda own: {**own, "bridged_share": 0.0} if own.get("stride", 1) > 1 else own,
         ),
         Gate(
             "camera_consistency",
@@ -254,21 +243,23 @@ class Gatekeeper:
         A verdict applies to a result's bytes, and overrides metrics and policy: a rejected result
         waits for a correction, however good its metrics are.
         """
-        gate = GATES.get(stage)
-        if gate is None or (self.policy == "never" and not self._has_refusals()):
+        gate, questions = GATES.get(stage), self.match.journal.questions
+        verdicts = (it.verdict for it in questions if isinstance(it, ReviewDecision))
+        if gate is None or (self.policy == "never" and "reject" not in verdicts):
             return ()
         waiting = []
         for name, key in results.items():
-            if name.partition("/")[0] != stage:
+            of, _, unit = name.partition("/")
+            if of != stage:
                 continue
             manifest = self._manifest(name, key)
-            decision = last_decision(self.match.journal.questions, name, manifest.content)
+            decision = last_decision(questions, name, manifest.content)
             if decision is None:
                 reasons = self._reasons(gate, manifest)
                 if reasons and self._is_known(gate, name, manifest):
                     continue
                 if reasons:
-                    request = request_id(name, key)
+                    request = f"{stage[:24]}.{unit[:24]}.{key[:12]}"
                     waiting.append(WaitingUnit(unit=name, request=request, reasons=reasons))
             elif decision.verdict == "reject":
                 said = f"{decision.who} rejected it" + (f": {decision.why}" if decision.why else "")
@@ -278,10 +269,25 @@ class Gatekeeper:
         return tuple(waiting)
 
     def ask(self, run_id: str, waiting: Sequence[WaitingUnit], results: Mapping[str, str]) -> None:
-        """Add review requests to the journal, one per result."""
-        requests = [
-            self._request(unit, results[unit.unit], run_id) for unit in waiting if not unit.rejected
-        ]
+        """Add review requests to the journal, one per result: `tracking.clip.1f2e3d4c5b6a`."""
+        requests = []
+        for unit in waiting:
+            if unit.rejected:
+                continue
+            manifest = self._manifest(unit.unit, results[unit.unit])
+            requests.append(
+                ReviewRequest(
+                    id=unit.request,
+                    match_id=self.match.match_id,
+                    run_id=run_id,
+                    gate=unit.unit.partition("/")[0],
+                    keys={unit.unit: manifest.key},
+                    contents={unit.unit: manifest.content},
+                    reasons=unit.reasons,
+                    figures=manifest.figures,
+                    created_at=datetime.now(UTC),
+                )
+            )
 
         def new_requests(journal: Journal) -> list[ReviewRequest]:
             known = requests_by_id(journal.questions)
@@ -307,11 +313,11 @@ class Gatekeeper:
         A metric is the same question if it and its parts beyond the limit, such as cameras, got no
         worse. Counts, whose limit is zero, can be of other things, and are asked about again.
         """
-        journal = self.match.journal
-        asked = requests_by_id(journal.questions)
+        questions = self.match.journal.questions
+        asked = requests_by_id(questions)
         decided = [
             each
-            for each in journal.questions
+            for each in questions
             if isinstance(each, ReviewDecision)
             and each.request in asked
             and name in asked[each.request].keys
@@ -332,35 +338,9 @@ class Gatekeeper:
             for metric in gate.objections(manifest.figures)
         )
 
-    def _has_refusals(self) -> bool:
-        return any(
-            isinstance(record, ReviewDecision) and record.verdict == "reject"
-            for record in self.match.journal.questions
-        )
-
-    def _request(self, unit: WaitingUnit, key: str, run_id: str) -> ReviewRequest:
-        manifest = self._manifest(unit.unit, key)
-        return ReviewRequest(
-            id=unit.request,
-            match_id=self.match.match_id,
-            run_id=run_id,
-            gate=unit.unit.partition("/")[0],
-            keys={unit.unit: key},
-            contents={unit.unit: manifest.content},
-            reasons=unit.reasons,
-            figures=manifest.figures,
-            created_at=datetime.now(UTC),
-        )
-
     def _manifest(self, name: str, key: str) -> ResultManifest:
         stage, _, unit = name.partition("/")
         return self.store.manifest(self.match.match_id, stage, unit, key)
-
-
-def request_id(unit: str, key: str) -> str:
-    """Return the review request id of a result: `static_calibration.cam03.1f2e3d4c5b6a`."""
-    stage, _, name = unit.partition("/")
-    return f"{stage[:24]}.{name[:24]}.{key[:12]}"
 
 
 def waiting_for_verdicts(waiting: Iterable[WaitingUnit]) -> list[WaitingUnit]:

@@ -31,11 +31,10 @@ a detector's noise alone causes smaller decreases."""
 
 @dataclass(frozen=True)
 class Iteration:
-    """One iteration of the method.
+    """One iteration of the method, with the record of its run.
 
     Attributes:
         number: iteration number, from 1.
-        record: record of its run.
         held_out_error: mean distance of keypoints in held-out cameras to the reprojection from the
             others, all clips [box height]; None if it is undefined: only two cameras, or no
             detections.
@@ -44,11 +43,6 @@ class Iteration:
     number: int
     record: RunRecord
     held_out_error: float | None
-
-    def is_better_than(self, other: Iteration) -> bool:
-        """Return whether it lowers the held-out error by more than `GAIN`."""
-        ours, theirs = self.held_out_error, other.held_out_error
-        return ours is not None and (theirs is None or ours < (1.0 - GAIN) * theirs)
 
 
 @dataclass(frozen=True)
@@ -145,9 +139,12 @@ def _recorded_run(store: Store, match: Match, plan: RunPlan) -> RunRecord | None
 
 
 def _best(passes: list[Iteration]) -> Iteration:
+    """Return the last one that lowers the held-out error of the best before by over `GAIN`."""
     best = passes[0]
     for iteration in passes[1:]:
-        if iteration.record.state == "complete" and iteration.is_better_than(best):
+        ours, theirs = iteration.held_out_error, best.held_out_error
+        is_better = ours is not None and (theirs is None or ours < (1.0 - GAIN) * theirs)
+        if iteration.record.state == "complete" and is_better:
             best = iteration
     return best
 

@@ -25,7 +25,7 @@ from data_contracts.work import Work
 from flows.orchestration.local_cluster import require_workers, short_seconds
 from flows.overview import make_summary
 from flows.progress import reporter
-from flows.registering import open_for_review, open_match
+from flows.registering import open_match
 from flows.run_plan import PlannedUnit
 from flows.run_record import RunLog, describe_end
 from flows.settings import TimeLimits, seconds_of, selected_stages
@@ -82,15 +82,9 @@ def process_match(
 ) -> str:
     """Run the method on one match, record the run and return its number.
 
-    Args:
-        project: folder or URL of the store.
-        match_id: a registered match.
-        settings: stage to its settings that differ from their defaults.
-        from_stage: first stage to run; the latest run supplies earlier results.
-        until_stage: last stage to run.
-        gates: when results need review; None is `never`.
-        iteration: iteration number; the previous iterations have their results.
-        time_limits: stage to the time limit of a unit [min], if not the default.
+    The settings by stage are those that differ from their defaults, and the time limits of a unit
+    by stage [min], too. The latest run supplies the results before `from_stage`, and the iterations
+    before this one have theirs. Without `gates`, no result needs review.
 
     Raises:
         IncompleteRunError: some units failed or need review; the others have their results.
@@ -100,18 +94,13 @@ def process_match(
     store = Store.open(project)
     stages = selected_stages(from_stage, until_stage)
     # 2D poses can locate cameras that nothing else tells.
-    opening = open_for_review if until_stage in WITHOUT_CAMERAS else open_match
-    match = opening(store, match_id)
+    match = open_match(store, match_id, unfinished=until_stage in WITHOUT_CAMERAS)
     log = RunLog.begin(store, match, stages, settings, gates or "never", iteration)
     return require_complete(run_stages(log, time_limits or {}))
 
 
 def require_complete(record: RunRecord) -> str:
-    """Return the number of a complete run.
-
-    Raises:
-        IncompleteRunError: the run is not complete.
-    """
+    """Return the number of a complete run."""
     if record.state != "complete":
         raise IncompleteRunError(record)
     return record.run_id

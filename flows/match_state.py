@@ -43,11 +43,9 @@ START_SECONDS: Final = 10.0
 
 @dataclass(frozen=True)
 class MatchState:
-    """The one true state of a match.
+    """The one true state of a match: its kind, a few words such as `2 questions`, and why.
 
     Attributes:
-        name: its kind.
-        words: the state in a few words, such as `2 questions`.
         why: the reason, in sentences; empty if the words say all.
         todo: what a person can do.
         seconds: expected time of the next run [s]; None if it computes nothing or is unknown.
@@ -76,7 +74,12 @@ def match_state(store: Store, match: Match) -> MatchState:
         states = [(unit.name, unit_state(unit, latest)) for unit in plan]
         units = {state: tuple(n for n, its in states if its == state) for state in UnitState}
     missing = [unit for unit in plan if not unit.published]
-    further = _further_iterations(store, match, latest) if latest and not missing else []
+    further: list[PlannedUnit] = []
+    if latest and not missing:
+        ahead = resolve(match.layers)
+        for number in range(latest.iteration + 1, last_iteration(latest, ahead) + 1):
+            then = plan_run(store, match, ahead.overrides, iteration=number)
+            further += [unit for unit in then if not unit.published]
     found = _find(store, match, latest, units, plan, further)
     missing += further
     seconds = None
@@ -137,14 +140,6 @@ def _find(
     words = "ready" if usability.verdict == "usable" else usability.verdict
     why = " ".join(usability.reservations)
     return MatchState("ready", words, why, todo="Download the results.")
-
-
-def _further_iterations(store: Store, match: Match, latest: RunRecord) -> list[PlannedUnit]:
-    """Return the units to compute in iterations that are set beyond that of the latest run."""
-    found = resolve(match.layers)
-    numbers = range(latest.iteration + 1, last_iteration(latest, found) + 1)
-    plans = (plan_run(store, match, found.overrides, iteration=number) for number in numbers)
-    return [unit for plan in plans for unit in plan if not unit.published]
 
 
 def _open_runs(store: Store, match_id: str, latest: RunRecord | None) -> tuple[bool, str]:
@@ -238,8 +233,10 @@ def _describe_failure(record: RunRecord) -> tuple[str, str, str]:
     waits = _count(len(record.blocked), "later step waits", "later steps wait")
     further = f" {_count(len(others), 'other step', 'other steps')} failed too." if others else ""
     further += f" {waits} for it." if record.blocked else ""
+    why = " ".join(first.message.split())
+    why = why if why.endswith((".", "!", "?")) else f"{why}."
     todo = "Correct the cause, then run again: finished steps are kept."
-    return f"failed: {step_words(first)}", f"{_sentence(first.message)}{further}", todo
+    return f"failed: {step_words(first)}", why + further, todo
 
 
 def _describe_part(record: RunRecord) -> tuple[str, str, str]:
@@ -258,11 +255,6 @@ def step_words(failure: UnitFailure) -> str:
     """Return a failed step in words: `tracking of clip`."""
     stage, _, unit = failure.unit.partition("/")
     return f"{stage.replace('_', ' ')} of {unit}"
-
-
-def _sentence(text: str) -> str:
-    text = " ".join(text.split())
-    return text if text.endswith((".", "!", "?")) else f"{text}."
 
 
 def _count(number: int, one: str, many: str) -> str:

@@ -41,7 +41,20 @@ def tell_lineage(store: Store, record: RunRecord) -> None:
     if not address:
         return
     try:
-        _send(address, [json.dumps(each) for each in lineage_events(store, record)])
+        events = [json.dumps(each) for each in lineage_events(store, record)]
+        parts = urlsplit(address)
+        if parts.scheme == "file":
+            with Path(unquote(parts.path)).open("a", encoding="utf-8") as file:
+                file.write("".join(f"{event}\n" for event in events))
+            return
+        endpoint = os.environ.get("OPENLINEAGE_ENDPOINT", "api/v1/lineage")
+        headers = {"content-type": "application/json"}
+        if key := os.environ.get("OPENLINEAGE_API_KEY"):
+            headers["authorization"] = f"Bearer {key}"
+        with httpx.Client(headers=headers, timeout=ANSWER_SECONDS) as client:  # one connection
+            for event in events:
+                answer = client.post(f"{address.rstrip('/')}/{endpoint.lstrip('/')}", content=event)
+                answer.raise_for_status()
     except (OSError, httpx.HTTPError, httpx.InvalidURL) as error:
         LOG.warning("%s took not all lineage of %s: %s", URL, record.match_id, error)
 
@@ -59,13 +72,10 @@ def lineage_events(store: Store, record: RunRecord) -> Iterator[dict[str, Any]]:
             {"namespace": "worldpose.match", "name": f"{record.match_id}/{source}"}
             for source in sorted(manifest.recipe.sources)
         ]
-        output = _dataset(store, record, name, manifest.key)
+        outputs = [_dataset(store, record, name, manifest.key)]
         yield {**_event(store, record, name, "START", start), "inputs": inputs}
-        yield {
-            **_event(store, record, name, "COMPLETE", end),
-            "inputs": inputs,
-            "outputs": [output],
-        }
+        event = _event(store, record, name, "COMPLETE", end)
+        yield {**event, "inputs": inputs, "outputs": outputs}
     for failure in record.failed:
         facet = {
             "message": failure.message,
@@ -116,20 +126,3 @@ def _producer() -> str:
 
 def _uuid(name: str) -> str:
     return str(uuid.uuid5(uuid.NAMESPACE_URL, name))
-
-
-def _send(address: str, events: list[str]) -> None:
-    parts = urlsplit(address)
-    if parts.scheme == "file":
-        with Path(unquote(parts.path)).open("a", encoding="utf-8") as file:
-            file.write("".join(f"{event}\n" for event in events))
-        return
-    endpoint = os.environ.get("OPENLINEAGE_ENDPOINT", "api/v1/lineage")
-    headers = {"content-type": "application/json"}
-    key = os.environ.get("OPENLINEAGE_API_KEY")
-    if key:
-        headers["authorization"] = f"Bearer {key}"
-    with httpx.Client(headers=headers, timeout=ANSWER_SECONDS) as client:  # one connection
-        for event in events:
-            answer = client.post(f"{address.rstrip('/')}/{endpoint.lstrip('/')}", content=event)
-            answer.raise_for_status()

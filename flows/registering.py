@@ -41,9 +41,6 @@ def register(
     folder that it `replaces`: then runs, corrections and names stay. `unfinished` accepts it
     without all cameras known; people click them on the pages. `known_as` is the id that the folder
     must have.
-
-    Raises:
-        InputError: the folder is not a valid match, or its id or content is already registered.
     """
     spec = read_spec(folder)
     match_id = spec.match_id
@@ -101,18 +98,27 @@ def register_next(folder: MatchFolder, before: Registration) -> Registration:
     return register_match(folder, at_home)
 
 
-def open_match(store: Store, match_id: str) -> Match:
+def open_match(store: Store, match_id: str, *, unfinished: bool = False) -> Match:
     """Open a registered match and read its folder again: annotations may have changed since.
 
-    Raises:
-        InputError: there is no such match, or its folder is invalid or holds another match.
+    `unfinished` accepts it without all cameras known.
     """
-    return _open_registered(store, match_id, unfinished=False)
+    known = find_registration(store, match_id)
+    match_id, folder = known.spec.match_id, Path(known.folder)
+    if not _is_there(folder):
+        raise InputError(
+            f"match {match_id}",
+            expected=f"its folder, registered as {folder}",
+            found="nothing there",
+            todo="Mount its disk. If it was moved, or restored elsewhere, register it there, and "
+            "its results stay: worldpose ingest FOLDER.",
+        )
+    return register(store, folder, unfinished=unfinished, known_as=match_id)[0]
 
 
 def open_for_review(store: Store, match_id: str) -> Match:
     """Open a registered match like `open_match`, even if cameras are missing."""
-    return _open_registered(store, match_id, unfinished=True)
+    return open_match(store, match_id, unfinished=True)
 
 
 def open_stored(store: Store, name: str) -> Match:
@@ -139,28 +145,11 @@ def open_stored(store: Store, name: str) -> Match:
         return Match(folder, registration, journal, layers=layers)
 
 
-def _open_registered(store: Store, name: str, *, unfinished: bool) -> Match:
-    known = find_registration(store, name)
-    match_id, folder = known.spec.match_id, Path(known.folder)
-    if not _is_there(folder):
-        raise InputError(
-            f"match {match_id}",
-            expected=f"its folder, registered as {folder}",
-            found="nothing there",
-            todo="Mount its disk. If it was moved, or restored elsewhere, register it there, and "
-            "its results stay: worldpose ingest FOLDER.",
-        )
-    return register(store, folder, unfinished=unfinished, known_as=match_id)[0]
-
-
 def find_registration(store: Store, name: str) -> Registration:
     """Return the registration of a match given by folder or id.
 
     Only the id is read from the match folder, and nothing is written: results stay readable when
     the folder has moved or has been edited.
-
-    Raises:
-        InputError: there is no such match.
     """
     folder = Path(name)
     match_id = read_spec(folder).match_id if (folder / "match.yaml").is_file() else name
@@ -179,14 +168,11 @@ def find_registration(store: Store, name: str) -> Registration:
 
 
 def find_match(store: Store, name: str, *, unfinished: bool = False) -> Match:
-    """Open a match given by folder or id; a folder is registered first.
-
-    `unfinished` accepts it without all cameras known.
-    """
+    """Open a match given by folder or id as `open_match`; a folder is registered first."""
     folder = Path(name)
     if (folder / "match.yaml").is_file() or (folder.is_dir() and name not in store.matches()):
         return register(store, folder, unfinished=unfinished)[0]
-    return open_for_review(store, name) if unfinished else open_match(store, name)
+    return open_match(store, name, unfinished=unfinished)
 
 
 def _refuse_duplicate(store: Store, registration: Registration, *, is_next: bool) -> None:
@@ -214,10 +200,8 @@ def _is_there(folder: Path) -> bool:
     """Return whether the folder exists; one that does not answer counts as existing."""
     try:
         folder.stat()
-    except (FileNotFoundError, NotADirectoryError):
-        return False
-    except OSError:
-        return True
+    except OSError as error:
+        return not isinstance(error, FileNotFoundError | NotADirectoryError)
     return True
 
 

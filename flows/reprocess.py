@@ -16,7 +16,6 @@ from flows.run_plan import PlannedUnit
 from flows.run_record import AtWorkError, alone_with
 from flows.run_status import RunStatus, run_status
 from flows.running import RunRequest, run_match, settle, shared_machines
-from flows.stage import Match
 from worldpose.errors import InternalError, WorldposeError
 from worldpose.store.store import Store
 
@@ -30,12 +29,10 @@ class Reprocessed:
     """Outcome for one match.
 
     Attributes:
-        match_id: the match.
         state: never run and current: nothing to do; stale: not run, since only the check was
             requested; at work: not run, since another process runs it; otherwise the new run's
             state, or failed if there is none.
         status: what its latest run would recompute; None if that could not be determined.
-        record: record of the current run.
         problem: why the check failed or no run was recorded.
     """
 
@@ -91,7 +88,13 @@ def _reprocess(
             if is_rehearsal:
                 return Reprocessed(match_id, "stale", status, status.latest)
             reporter().say(f"{match_id}: {len(status.to_compute)} units to compute")
-            match, record = _run(store, status, machines_for(status.to_compute))
+            request = machines_for(status.to_compute)
+            request = replace(request, until_stage=status.until_stage, gates=status.gates)
+            match, request = settle(store, status.match, request)
+            if request.most_iterations == 1:
+                record = run_match(store, match, request)
+            else:
+                record = iterate_match(store, match, request, request.most_iterations).record
             try:
                 export_after_run(store, match, record)
             except (WorldposeError, OSError) as failure:
@@ -105,13 +108,3 @@ def _reprocess(
         reporter().say(f"{match_id} failed: {text}")
         return Reprocessed(match_id, "failed", status, problem=text)
     return Reprocessed(match_id, record.state, status, record)
-
-
-def _run(store: Store, status: RunStatus, request: RunRequest) -> tuple[Match, RunRecord]:
-    request = replace(request, until_stage=status.until_stage, gates=status.gates)
-    match, request = settle(store, status.match, request)
-    if request.most_iterations == 1:
-        record = run_match(store, match, request)
-    else:
-        record = iterate_match(store, match, request, request.most_iterations).record
-    return match, record

@@ -28,13 +28,9 @@ from worldpose.store.store import Store
 
 @dataclass(frozen=True)
 class PlannedUnit:
-    """One unit of a run.
+    """One unit of a run, in an iteration from 1; `key` is the digest of its recipe.
 
-    Attributes:
-        recipe: all that its result depends on.
-        key: digest of the recipe.
-        published: whether the store held its result when it was planned; otherwise it is to run.
-        iteration: the iteration that it belongs to, from 1.
+    It is published if the store held its result when it was planned; otherwise it is to run.
     """
 
     recipe: Recipe
@@ -69,11 +65,7 @@ class RunPlan:
     run will compute.
 
     Attributes:
-        store: store with existing results.
-        match: the match, with all its cameras.
         overrides: settings that differ from their defaults.
-        stages: stages of the run, in order.
-        iteration: iteration number, from 1.
         results: `stage/unit` to key of the results that the run has, or will have.
         before: the same plan for the previous iteration; None in the first.
         gatekeeper: decides which results need review; None = every result passes.
@@ -159,29 +151,25 @@ class RunPlan:
 
         The plan uses the cameras that no earlier result leaves out (`flows.left_out`).
         """
-        if self.before is None and stage.first_pass > 1:
+        before = self.before
+        if before is None and stage.first_pass > 1:
             return []
         results = self.usable_results
         earlier = METHOD[: METHOD.index(stage)]
         left_out = left_out_cameras(self.store, self.match, earlier, results)
         match = self.match.without(left_out)
-        lacks_cameras = len(match.folder.spec.static_cameras) < stage.min_cameras
-        if stage.min_cameras and not _cameras_are_decided(match, earlier, results):
+        lacks = bool(left_out) and len(match.folder.spec.static_cameras) < stage.min_cameras
+        # Every result that can leave cameras out exists, and none waits.
+        is_decided = not stage.min_cameras or all(
+            f"{each.name}/{unit}" in results
+            for each in earlier
+            if each.leaves_out
+            for unit in each.units(match)
+        )
+        if lacks or not is_decided:
             self.blocked += (f"{stage.name}/{unit}" for unit in stage.units(match))
+            self.lacks_cameras |= is_decided
             return []
-        if left_out and lacks_cameras:
-            self.blocked += (f"{stage.name}/{unit}" for unit in stage.units(match))
-            self.lacks_cameras = True
-            return []
-        planned = self._plan_units(match, stage, results)
-        self.units += planned
-        return planned
-
-    def _plan_units(
-        self, match: Match, stage: Stage, results: Mapping[str, str]
-    ) -> list[PlannedUnit]:
-        """Plan the units of a stage for a match without the cameras that are left out."""
-        before = self.before
         settings = settings_of(stage, self.overrides)
         names, units = stage.units(match), []
         outside = stage.external_inputs(match, settings) if names else {}
@@ -211,6 +199,7 @@ class RunPlan:
             key = recipe_key(recipe)
             published = self.store.has(match.match_id, stage.name, unit, key)
             units.append(PlannedUnit(recipe, key, published, self.iteration))
+        self.units += units
         return units
 
     def add_results(self, units: Iterable[PlannedUnit]) -> None:
@@ -259,9 +248,6 @@ def plan_ahead(
 
     The plan assumes that every unit succeeds and that every missing result passes its gate.
     `iteration` counts if the run does not continue the latest one.
-
-    Raises:
-        UsageError: the latest run lacks inputs of the stages.
     """
     plan = RunPlan.begin(gatekeeper, stages, overrides, latest, iteration)
     for stage in stages:
@@ -344,13 +330,3 @@ def _inputs_from_before(store: Store, match: Match, latest: RunRecord) -> dict[s
             inputs = manifest.recipe.inputs
             before |= {each: inputs[each] for each in taken if each in inputs}
     return before
-
-
-def _cameras_are_decided(
-    match: Match, stages: tuple[Stage, ...], results: Mapping[str, str]
-) -> bool:
-    """Return whether every result that can leave cameras out exists, and none waits."""
-    judging = (stage for stage in stages if stage.leaves_out)
-    return all(
-        f"{stage.name}/{unit}" in results for stage in judging for unit in stage.units(match)
-    )

@@ -103,9 +103,6 @@ def alone_with(store: Store, match_id: str, *, wait: bool = False) -> Iterator[N
     """Hold a match, so that no other process of this machine runs it; or wait until none does.
 
     Every door that runs a match holds it, from before its settings are read to its record.
-
-    Raises:
-        AtWorkError: another process runs it, and this one does not wait.
     """
     said = LOG.info
     while True:  # not one long wait: a process that hangs uses no processor time
@@ -164,7 +161,12 @@ def expected_work(
     spec = match.folder.spec
     cameras = {each.id: each for each in spec.cameras}
     clips = {each.id: each for each in spec.clips}
-    before = _latest_seconds(store, latest)
+    results = {} if latest is None else latest.results
+    before: dict[str, float] = {}
+    for stage, unit in dict(name.split("/", 1) for name in results).items():
+        place = (match.match_id, stage, unit, results[f"{stage}/{unit}"])
+        if store.has(*place):
+            before[stage] = store.manifest(*place).seconds
     work: dict[str, float] = {}
     for stage, unit in (planned.name.split("/", 1) for planned in missing):
         seconds = before.get(stage)
@@ -175,18 +177,6 @@ def expected_work(
             seconds = first_seconds(match.folder, stage, camera, clip)
         work[stage] = work.get(stage, 0.0) + max(seconds, 1e-3)
     return work
-
-
-def _latest_seconds(store: Store, latest: RunRecord | None) -> dict[str, float]:
-    """Return the computation time of one unit of each stage of a run [s]."""
-    if latest is None:
-        return {}
-    found = {}
-    for stage, unit in dict(name.split("/", 1) for name in latest.results).items():
-        key = latest.results[f"{stage}/{unit}"]
-        if store.has(latest.match_id, stage, unit, key):
-            found[stage] = store.manifest(latest.match_id, stage, unit, key).seconds
-    return found
 
 
 def first_seconds(
@@ -239,16 +229,17 @@ class RunLog:
         gates: GatePolicy = "never",
         iteration: int = 1,
     ) -> Self:
-        """Reserve a new run; the latest run supplies the results of earlier stages.
-
-        Raises:
-            EditedMeanwhileError: the previous iteration lacks the inputs of this one.
-        """
+        """Reserve a new run; the latest run supplies the results of earlier stages."""
         latest = latest_run(store, match.match_id)
         gatekeeper = Gatekeeper(store, match, gates)
         plan = RunPlan.begin(gatekeeper, stages, overrides, latest, iteration)
-        if plan.before is not None:
-            _require_inputs(store, match, stages, plan.before)
+        if plan.before is not None and (lost := lost_inputs(store, match, stages, plan.before)):
+            raise EditedMeanwhileError(
+                f"another iteration of {match.match_id}",
+                expected="the results of the previous iteration",
+                found=f"none of {', '.join(lost)}",
+                todo=f"Restart the iterations: worldpose run {match.match_id} --iterations N.",
+            )
         run_id = store.reserve_run(match.match_id)
         for unit in plan.waiting:
             reporter().unit_waits(unit.unit, unit.reasons)
@@ -272,13 +263,9 @@ class RunLog:
             with stage_span(stage.name, len(units)):
                 for unit, failure in compute(stage, units):
                     self.finish_unit(unit, failure)
-            self.hold(stage)
+            for held in self.plan.hold(stage, self.plan.results):
+                reporter().unit_waits(held.unit, held.reasons)
         return self.close()
-
-    def hold(self, stage: Stage) -> None:
-        """Hold back results of a finished stage that need review."""
-        for unit in self.plan.hold(stage, self.plan.results):
-            reporter().unit_waits(unit.unit, unit.reasons)
 
     def reuse(self, units: Iterable[PlannedUnit]) -> None:
         """Take over results that the store already holds."""
@@ -422,17 +409,3 @@ class RunLog:
         last = next((name for name in reversed(asked) if name in through), asked[-1])
         there = any(name.startswith(f"{last}/") for name in self.plan.results)
         return "partial" if there else "failed"
-
-
-def _require_inputs(
-    store: Store, match: Match, stages: tuple[Stage, ...], before: Mapping[str, str]
-) -> None:
-    """Refuse an iteration if the previous one has other results than its inputs."""
-    lost = lost_inputs(store, match, stages, before)
-    if lost:
-        raise EditedMeanwhileError(
-            f"another iteration of {match.match_id}",
-            expected="the results of the previous iteration",
-            found=f"none of {', '.join(lost)}",
-            todo=f"Restart the iterations: worldpose run {match.match_id} --iterations N.",
-        )

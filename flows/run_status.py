@@ -8,17 +8,16 @@ plan of now is compared with a match's latest run.
 from __future__ import annotations
 
 import builtins
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final
+from typing import Any, Final
 
 from data_contracts.run import GatePolicy, RunRecord
 from data_contracts.work import Recipe
 from flows.gates import Gatekeeper
 from flows.method import METHOD, unit_order
 from flows.registering import open_match
-from flows.run_plan import PlannedUnit, RunPlan, plan_ahead, plan_run
+from flows.run_plan import PlannedUnit, plan_ahead, plan_run
 from flows.run_record import latest_run
 from flows.settings import Overrides, ResolvedSettings, resolve, selected_stages
 from flows.stage import Match
@@ -72,16 +71,6 @@ class UnitStatus:
     state: UnitState
     run_id: str | None
     reasons: tuple[Reason, ...]
-
-    @property
-    def unit(self) -> str:
-        """Name as `stage/unit`."""
-        return self.planned.name
-
-    @property
-    def iteration(self) -> int:
-        """The iteration that it belongs to, from 1."""
-        return self.planned.iteration
 
     @property
     def own_reasons(self) -> tuple[Reason, ...]:
@@ -181,9 +170,6 @@ class RunStatus:
     """The stages that a match's latest run would recompute.
 
     Attributes:
-        match: match with all current corrections and verdicts.
-        latest: the current run.
-        gates: when results of the next run need review.
         until_stage: last stage of that run; None = the method's last.
         units: units that differ from the run, in order.
         is_stale: whether there is anything to do, even only to apply a verdict.
@@ -233,9 +219,15 @@ def run_status(
         is_kept = plan.iteration == latest.iteration
         record = latest if is_kept else _run_of_iteration(store, latest, plan.iteration)
         is_recorded = is_recorded or plan.is_recorded_by(latest)
-        stale = _stale_units(store, plan, record, hopeless)
-        # Only the results of other iterations count: their records can have other settings.
-        units += [unit for unit in stale if is_kept or unit.state != UnitState.READY]
+        failing: set[str] = set()
+        for unit in plan.units:
+            if (unit.name, unit.key) in hopeless.items() or failing & unit.recipe.inputs.keys():
+                failing.add(unit.name)
+                continue
+            state = unit_state(unit, record)
+            # Only the results of other iterations count: their records can have other settings.
+            if state != UnitState.CURRENT and (is_kept or state != UnitState.READY):
+                units.append(unit_status(store, unit, record))
     is_settled = latest.state in ("complete", "waiting")
     return RunStatus(
         match=match,
@@ -245,21 +237,6 @@ def run_status(
         units=tuple(units),
         is_stale=bool(units) or (is_settled and not is_recorded),
     )
-
-
-def _stale_units(
-    store: Store,
-    plan: RunPlan,
-    record: RunRecord | None,
-    hopeless: Mapping[str, str | None],
-) -> Iterator[UnitStatus]:
-    """Yield the units that differ from a run, except those that would fail again."""
-    failing: set[str] = set()
-    for unit in plan.units:
-        if (unit.name, unit.key) in hopeless.items() or failing & unit.recipe.inputs.keys():
-            failing.add(unit.name)
-        elif unit_state(unit, record) != UnitState.CURRENT:
-            yield unit_status(store, unit, record)
 
 
 def last_stage(match: Match, latest: RunRecord) -> str | None:
@@ -281,10 +258,10 @@ def _run_of_iteration(store: Store, latest: RunRecord, number: int) -> RunRecord
 
 @dataclass(frozen=True)
 class UnitChange:
-    """Change of one unit between two runs.
+    """Change of one unit between two runs: same, changed, only in A or only in B.
 
-    It is same, changed, only in A or only in B. The reasons are differences of the recipes; figures
-    are name, value in A and value in B of the metrics that differ.
+    The reasons are differences of the recipes; figures are name, value in A and value in B of the
+    metrics that differ.
     """
 
     unit: str
@@ -293,22 +270,8 @@ class UnitChange:
     figures: tuple[tuple[str, float, float], ...]
 
 
-@dataclass(frozen=True)
-class Explanation:
-    """State of a unit (`UnitState`), its current key, and the reasons as lines for people."""
-
-    unit: str
-    state: str
-    key: str
-    reasons: tuple[str, ...]
-
-
 def find_run(store: Store, name: str) -> RunRecord:
-    """Return the run named by `match/number` or `match/name`, or `match` for its latest.
-
-    Raises:
-        InputError: no such run.
-    """
+    """Return the run named by `match/number` or `match/name`, or `match` for its latest."""
     match_id, _, number = name.partition("/")
     runs = store.runs(match_id) if match_id in store.matches() else []
     names = {pin.name: pin.run_id for pin in list_pins(store.blobs, match_id)} if runs else {}
@@ -346,13 +309,10 @@ def run_difference(store: Store, a: RunRecord, b: RunRecord) -> list[UnitChange]
     return changes
 
 
-def explain_unit(store: Store, name: str, overrides: Overrides) -> Explanation:
-    """Return a unit's state and the reasons for it.
+def explain_unit(store: Store, name: str, overrides: Overrides) -> dict[str, Any]:
+    """Return a unit's name, state (`UnitState`), current key, and the reasons as lines for people.
 
     The unit is `match/stage/unit`; the overrides go beyond the settings of the layers.
-
-    Raises:
-        InputError: no such unit.
     """
     match_id, _, unit_name = name.partition("/")
     match = open_match(store, match_id)
@@ -366,11 +326,10 @@ def explain_unit(store: Store, name: str, overrides: Overrides) -> Explanation:
             todo="Write it as MATCH/STAGE/UNIT.",
         )
     status = unit_status(store, planned[unit_name], latest)
-    failed = () if latest is None else latest.failed
     failures = tuple(
         f"run {match_id}/{latest.run_id} failed with the same input and settings: {each.message}"
-        for each in failed
+        for each in (latest.failed if latest else ())
         if latest is not None and each.unit == unit_name and each.key == status.planned.key
     )
-    reasons = failures or status.describe()
-    return Explanation(name, status.state.value, status.planned.key, reasons)
+    found = {"unit": name, "state": status.state.value, "key": status.planned.key}
+    return {**found, "reasons": failures or status.describe()}

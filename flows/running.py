@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from multiprocessing.resource_tracker import ensure_running
 from pathlib import Path
@@ -77,7 +77,6 @@ class RunRequest:
         settings: stage to the settings that the run states, which its match keeps; all settings
             of the run once it is settled (`settle`).
         from_stage: first stage; the latest run supplies earlier results.
-        until_stage: last stage.
         dask: address of a running Dask scheduler; None starts workers on this machine.
         workers: number of worker processes on this machine; None = one per core, as far as there is
             work for them.
@@ -145,10 +144,18 @@ def settle(store: Store, match: Match, request: RunRequest) -> tuple[Match, RunR
         with alone(store.blobs, SETTINGS_LOCK, wait=True):
             *others, own = read_layers(store, match.registration.spec)  # it can have changed since
             check_general(own.name, "the request", stated)
-            values = {**_kept_values(own, request), **stated}
+            kept = {
+                name: value
+                for name, value in own.values.items()
+                if not request.default_settings
+                or ("." not in name and name not in ("iterations", "body_folder"))
+            }
+            values = {**kept, **stated}
             found = resolve([*others, replace(own, values=values)])
             folder = found.origins.get("body_folder")
-            if folder is not None and folder.name == ENVIRONMENT and _needs_bodies(found):
+            models = [each.get("body_model") for each in found.overrides.values()]
+            needs_bodies = any(isinstance(it, str) and not is_open_body(it) for it in models)
+            if folder is not None and folder.name == ENVIRONMENT and needs_bodies:
                 # Another shell, or the service, may not have the variable.
                 values["body_folder"] = folder.values["body_folder"]
             settled = replace(match, layers=(*others, replace(own, values=values)))
@@ -171,17 +178,6 @@ def settle(store: Store, match: Match, request: RunRequest) -> tuple[Match, RunR
     )
 
 
-def _kept_values(own: Layer, request: RunRequest) -> dict[str, JsonValue]:
-    """Return what a match's layer keeps beside what a request states."""
-    if not request.default_settings:
-        return dict(own.values)
-    return {
-        name: value
-        for name, value in own.values.items()
-        if "." not in name and name not in ("iterations", "body_folder")
-    }
-
-
 def _report_lost(own: Layer, values: Mapping[str, JsonValue]) -> None:
     """Report what a match's layer has lost, of which only `values` are left."""
     for name, was in own.values.items():
@@ -196,11 +192,7 @@ def _report_lost(own: Layer, values: Mapping[str, JsonValue]) -> None:
 
 
 def require_whole(request: RunRequest) -> None:
-    """Refuse iterations of a part of the method.
-
-    Raises:
-        UsageError: only a part of the method was requested.
-    """
+    """Refuse iterations of a part of the method."""
     if selected_stages(request.from_stage, request.until_stage) != METHOD:
         raise UsageError(
             "--iterations",
@@ -220,12 +212,6 @@ def _require_usable(match: Match, request: RunRequest, overrides: Overrides) -> 
         is_used = stage in part and stage.units(match)
         if is_used or stage.name in request.settings:
             stage.external_inputs(match, settings_of(stage, overrides))
-
-
-def _needs_bodies(found: ResolvedSettings) -> bool:
-    """Return whether a run needs an installed body."""
-    models = (values.get("body_model") for values in found.overrides.values())
-    return any(isinstance(name, str) and not is_open_body(name) for name in models)
 
 
 def _report_settings(
@@ -368,24 +354,23 @@ def _machines(
         # Imported here: it takes seconds, while server and workers start.
         importlib.import_module("flows.match")
 
-        if not is_watched:
-            stack.enter_context(_without_heartbeats())
+        if not is_watched:  # no heartbeats, for which each run would wait one second at its end
+            from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
+
+            stack.enter_context(temporary_settings({PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}))
         try:
             wait_until_ready()
         except WorldposeError as failure:
             require_room(failure, store.url)
             raise
         if cluster is not None:
-            _import_tasks(missing)  # a core is idle until the first worker has started
+            # What the flow would import when it starts and with each stage's first unit: a core is
+            # idle until the first worker has started.
+            tasks = task_modules(unit.recipe.stage for unit in missing)
+            for name in ("prefect.flow_engine", "prefect_dask", "tasks.batch", *tasks):
+                importlib.import_module(name)
             wait_for_worker(cluster)
         yield request, ask_for
-
-
-def _import_tasks(missing: Iterable[PlannedUnit]) -> None:
-    """Import what the flow would import when it starts and with each stage's first unit."""
-    tasks = task_modules(unit.recipe.stage for unit in missing)
-    for name in ("prefect.flow_engine", "prefect_dask", "tasks.batch", *tasks):
-        importlib.import_module(name)
 
 
 @contextmanager
@@ -426,13 +411,6 @@ def _start_quiet_tracker() -> None:
             del os.environ["PYTHONWARNINGS"]
         else:
             os.environ["PYTHONWARNINGS"] = before
-
-
-def _without_heartbeats() -> AbstractContextManager[Any]:
-    """Disable heartbeats, for which each run would wait one second at its end."""
-    from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
-
-    return temporary_settings({PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None})
 
 
 def _require_scheduler(address: str, security: Security | None) -> None:

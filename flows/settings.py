@@ -129,11 +129,7 @@ def resolve(layers: Iterable[Layer], stated: Overrides | None = None) -> Resolve
 
 
 def require_known(name: str, where: str) -> None:
-    """Check the name of a setting; the error suggests a similar one, not all 190.
-
-    Raises:
-        UsageError: there is no such setting.
-    """
+    """Check the name of a setting; the error suggests a similar one, not all 190."""
     if name not in _built_in():
         close = get_close_matches(name, _built_in(), n=1)
         raise UsageError(
@@ -192,11 +188,7 @@ LIST = "List all settings: worldpose settings --list."
 
 
 def selected_stages(from_stage: str | None, until_stage: str | None) -> tuple[Stage, ...]:
-    """Return the stages between two stages, both included.
-
-    Raises:
-        UsageError: an unknown stage, or the first comes after the last.
-    """
+    """Return the stages between two stages, both included."""
     names = [stage.name for stage in METHOD]
     first = 0 if from_stage is None else _place("--from", from_stage, names)
     last = len(names) - 1 if until_stage is None else _place("--until", until_stage, names)
@@ -214,9 +206,6 @@ def parse_overrides(assignments: list[str], stages: tuple[Stage, ...] = METHOD) 
     """Parse settings given as `stage.name=value`; values are JSON, or else text.
 
     A setting of a stage that does not run would have no effect.
-
-    Raises:
-        UsageError: an unknown stage or setting, or an invalid value.
     """
     overrides: dict[str, dict[str, JsonValue]] = {}
     by_name = {stage.name: stage for stage in stages}
@@ -269,11 +258,7 @@ def as_text(value: JsonValue) -> str:
 
 
 def settings_of(stage: Stage, overrides: Overrides) -> Record:
-    """Return the stage's settings with `overrides` applied.
-
-    Raises:
-        UsageError: a value is invalid.
-    """
+    """Return the stage's settings with `overrides` applied."""
     given = dict(overrides.get(stage.name, {}))
     try:
         settings = stage.settings.model_validate(given)
@@ -315,11 +300,7 @@ def seconds_of(stage: str, limits: TimeLimits) -> float:
 
 
 def parse_time_limits(given: Sequence[str]) -> TimeLimits:
-    """Parse limits given as minutes for every stage, or as `stage=minutes`; later ones win.
-
-    Raises:
-        UsageError: an unknown stage, or not a number of minutes.
-    """
+    """Parse limits given as minutes for every stage, or as `stage=minutes`; later ones win."""
     limits: dict[str, float] = {}
     names = [stage.name for stage in METHOD]
     for text in given:

@@ -26,9 +26,6 @@ class Match:
     """A registered match: its folder as validated and corrected, and the digests of its files.
 
     Attributes:
-        folder: its content, with corrections applied.
-        registration: the project's entry for the match.
-        journal: verdicts and corrections.
         corrections: the corrections applied in `folder`.
         stale: corrections that no longer apply, each with the reason.
         layers: layers of settings, the first with the least precedence (`flows.layers`).
@@ -124,14 +121,12 @@ class Stage:
 
     Attributes:
         name: the one name of this stage, and of its task.
-        about: text of progress lines.
         settings: the record of its settings; by default it has none.
         units: names of the pieces that are computed, retried and stored separately.
         inputs: returns the `stage/unit` names of a unit's input results.
         sources: returns all data of the match folder that a unit's result depends on.
         previous_pass_inputs: returns a unit's further inputs from the previous iteration.
         late_inputs: returns a unit's further inputs from its own iteration, from the second on.
-        first_pass: the first iteration that includes the stage.
         external_inputs: returns the digests of the external files that its settings name, for a
             match.
         worker_tag: tag of the workers that compute it, if the cluster has any.

@@ -44,7 +44,6 @@ class _Rule:
     """Metric with a limit; larger is worse.
 
     Attributes:
-        stage: the stage of the metric.
         metric: its name; parts are `metric.part`.
         limit: name in `UsableLimits`; empty = a limit of zero.
         says: the reservation, with places for the unit, the value, the parts, and when.
@@ -135,10 +134,7 @@ class RunOutcome:
     """Results of a run, as they are judged.
 
     Attributes:
-        figures: unit, as `stage/unit`, to its metrics.
         warnings: unit to its warnings, in the order of the method.
-        left_out: a sentence for each camera that is left out.
-        failed: units without a result.
         lacks_results: whether no unit of the last requested stage has a result.
         lacks_people: whether no person was found, or too few cameras are left to place any.
         lacks_joints: whether no person has a joint in 3D.

@@ -20,12 +20,8 @@ def batch(name: str, module: str, work: list[str]) -> list[Exception | None]:
     """Compute and publish each unit like its own task; return the exception of each, or None.
 
     Two are computed at the same time. After its worker was killed, a retry resumes with the units
-    without a result, one by one: only the unit that ended the process may be given up.
-
-    Args:
-        name: name in the dashboard.
-        module: module with the task of the stage.
-        work: units of one stage, as JSON: Prefect inspects parameters of any other type.
+    without a result, one by one: only the unit that ended the process may be given up. `module` has
+    the task of their stage; the work is JSON, as Prefect inspects parameters of any other type.
     """
     units = [Work.model_validate_json(each) for each in work]
     compute = getattr(importlib.import_module(module), units[0].recipe.stage).fn

@@ -15,7 +15,6 @@ from data_contracts.arrays import Floats, GroupLayout, Integers
 from data_contracts.body_fitting import BODY_FITTING
 from data_contracts.keypoints import KeypointDetections
 from tasks.clip_inputs import (
-    ClipInputs,
     PagedArray,
     open_tracked_clip,
     triangulation_settings,
@@ -45,7 +44,7 @@ MEASURED_FRAMES: Final = 1000
 @unit_task
 def body_fitting(inputs: UnitInputs, result: ResultWriter) -> None:
     """Write bodies and their keypoints, and compare them with joints in held-out cameras."""
-    people = open_people(inputs)
+    people = ClipPeople(inputs)
     fit = write_fit(inputs, result, BODY_FITTING, people, inputs)
     if inputs.settings(BodyFittingSettings).method == "paper":
         return  # the comparison would refit our bodies
@@ -62,25 +61,17 @@ Views = Callable[[slice], tuple[RayConstraints, MonocularPoses | None]]
 
 
 class ClipPeople:
-    """Observations of the people of one clip by the static cameras, read by frames.
+    """Tracked and triangulated people of the unit's clip by the static cameras, read by frames.
 
     Attributes:
-        clip: cameras, detections, frames and clock.
         person: (persons,) ids.
         common_bias: (17,) per axis, systematic error shared by all views [m]; in the covariance of
             joints.
-        views: the moving cameras.
     """
 
-    def __init__(self, clip: ClipInputs, placed: xr.Dataset, views: Sequence[Views] = ()) -> None:
-        """Open the people.
-
-        Args:
-            clip: cameras and tracked people.
-            placed: the people's triangulated joints.
-            views: the moving cameras.
-        """
-        self.clip = clip
+    def __init__(self, inputs: UnitInputs, views: Sequence[Views] = ()) -> None:
+        placed = inputs.open(f"retriangulation/{inputs.unit}")
+        self.clip = open_tracked_clip(inputs)
         self.person: NDArray[np.integer] = placed["person"].values
         self.common_bias: Floats = placed["common_bias"].values
         self.views = views
@@ -173,12 +164,6 @@ class _Frames:
         return self.people[self.frames.start + frames]
 
 
-def open_people(inputs: UnitInputs, views: Sequence[Views] = ()) -> ClipPeople:
-    """Open the tracked and triangulated people of the unit's clip."""
-    placed = inputs.open(f"retriangulation/{inputs.unit}")
-    return ClipPeople(open_tracked_clip(inputs), placed, views)
-
-
 def extra_joints(placed: xr.Dataset) -> ExtraJoints | None:
     """Return the points besides COCO-17 of a result of triangulation; None without any."""
     if "extra_joints" not in placed:
@@ -231,13 +216,8 @@ def write_fit(
 ) -> BodyFit:
     """Fit the bodies of a clip in windows, and write them with their metrics.
 
-    Args:
-        inputs: the unit.
-        result: writer of the result.
-        layout: its layout.
-        people: people of the clip.
-        fitting: the unit of `body_fitting`, with settings, body model and pitch.
-        further: what a result has besides bodies.
+    `fitting` is the unit of `body_fitting`, with settings, body model and pitch; `further` is what
+    a result has besides bodies.
 
     Returns:
         Shapes and offsets of the clip, without bodies of any frame.
@@ -293,15 +273,10 @@ def write_fit(
 
 def frame_arrays(fit: BodyFit) -> dict[str, NDArray[Any]]:
     """Return the stored arrays with a frame dimension."""
-    arrays: dict[str, NDArray[Any]] = {
-        "global_orient": fit.parameters.global_orient,
-        "body_pose": fit.parameters.body_pose,
-        "transl": fit.parameters.transl,
-        "joints": fit.joints,
-        "covariance": fit.covariance,
-        "filled": fit.filled,
-        "guided": fit.guided,
-    }
+    pose = ("global_orient", "body_pose", "transl")
+    arrays: dict[str, NDArray[Any]] = {name: getattr(fit.parameters, name) for name in pose}
+    for name in ("joints", "covariance", "filled", "guided"):
+        arrays[name] = getattr(fit, name)
     if fit.extra is not None:
         arrays |= {"extra_joints": fit.extra.joints, "extra_covariance": fit.extra.covariance}
     return arrays

@@ -130,7 +130,7 @@ def broadcast_calibration(inputs: UnitInputs, result: ResultWriter) -> None:
         coordinates={"frame": inputs.frames},
         attributes=broadcast_attributes(_clip_of(inputs), calibration, start, clock.rate),
     )
-    result.figures.update(_figures(calibration.report, clock.rate))
+    result.figures.update(_figures(calibration.report))
     if reasons := calibration.report.reasons:
         result.warnings.append(
             f"the broadcast camera of {inputs.unit} needs a check: {'; '.join(reasons)}."
@@ -250,7 +250,7 @@ def _open_seen(inputs: UnitInputs) -> xr.Dataset | None:
     return None
 
 
-def _figures(report: BroadcastReport, rate: float) -> dict[str, float]:
+def _figures(report: BroadcastReport) -> dict[str, float]:
     """Return metrics of a calibrated clip; those that could not be computed are left out."""
     named = {
         "expected_error_median_px": report.reprojection_error,

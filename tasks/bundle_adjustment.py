@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.bundle_adjustment import BUNDLE_ADJUSTMENT
-from tasks.clip_inputs import (
-    ClipInputs,
-    open_frames,
-    open_venue,
-    select_frames,
-    triangulation_settings,
-)
+from tasks.clip_inputs import open_frames, open_venue, select_frames, triangulation_settings
 from tasks.unit import UnitInputs, unit_task
 from worldpose.bundle_adjustment.clip import Clicks, Clip
 from worldpose.bundle_adjustment.estimate import adjust_cameras
@@ -30,56 +25,52 @@ from worldpose.store.writer import ResultWriter
 @unit_task
 def bundle_adjustment(inputs: UnitInputs, result: ResultWriter) -> None:
     """Write the adjusted cameras and their outliers."""
-    settings = inputs.settings(BundleAdjustmentSettings)
-    people = _open_people(inputs, settings)
-    clip = open_frames(inputs, people.clip_frames)
-    adjusted = adjust_cameras(_open_clip(inputs, people, clip), settings)
-    arrays, attributes = adjustment_arrays(adjusted, settings, people.person)
+    settings, spans = inputs.settings(BundleAdjustmentSettings), inputs.sources["clips"]
+    clips = sorted(spans, key=lambda clip: spans[clip][0])
+    placed = {clip: inputs.open(f"triangulation/{clip}") for clip in clips}
+    frames = {clip: found["frame"].values for clip, found in placed.items()}
+    triangulation = triangulation_settings(inputs, clips[0])
+    stride = triangulation.stride(sum(count for _, count in spans.values()))
+    _require_computed(settings, spans, frames, stride)
+    opened = open_frames(inputs, frames)
+    pitch = opened.raise_pitch(inputs.pitch)
+    covariance = open_venue(inputs, opened.camera_ids).covariance
+    known = [inputs.open(f"static_calibration/{camera}") for camera in opened.camera_ids]
+    person, index, joints, views = _read_people(inputs, placed)
+    clip = Clip(
+        cameras=opened.cameras,
+        covariance=np.where(np.isfinite(covariance), covariance, 0.0),  # 0 = a given camera
+        clicks=tuple(_clicks(camera, pitch) for camera in known),
+        fps=float(inputs.sources["fps"]) / stride,
+        detections=opened.detections[:].assign_people(index),
+        joints=joints,
+        views=views,
+        triangulation=triangulation,
+        pitch=pitch,
+        on_lines=np.array([camera.attrs["origin"] == "lines" for camera in known]),
+        names=tuple(opened.camera_ids),
+    )
+    adjusted = adjust_cameras(clip, settings)
+    arrays, attributes = adjustment_arrays(adjusted, settings, person)
     attributes |= {"camera": inputs.sources["cameras"]}
-    attributes["surface"] = None if clip.surface is None else clip.surface.tolist()
+    attributes["surface"] = None if opened.surface is None else opened.surface.tolist()
     result.write(BUNDLE_ADJUSTMENT, arrays=arrays, attributes=attributes)
     result.figures.update(_figures(adjusted, attributes["camera"]))
 
 
-@dataclass(frozen=True)
-class _People:
-    """Tracked people in selected frames of all clips.
-
-    Attributes:
-        clip_frames: match frames by clip.
-        fps: frames per second.
-        person: (persons,) ids; the same id in two clips can be two people, and no code here
-            identifies them.
-        detection_index: (frames, cameras, persons).
-        joints: (frames, persons, 17, 3) [m], world.
-        views: (frames, persons, 17).
-    """
-
-    clip_frames: dict[str, NDArray[np.int64]]
-    fps: float
-    person: NDArray[np.int64]
-    detection_index: NDArray[np.int16]
-    joints: NDArray[np.float64]
-    views: NDArray[np.int64]
-
-
-def _open_people(inputs: UnitInputs, settings: BundleAdjustmentSettings) -> _People:
-    """Read tracks and joints in the frames that the first triangulation computed.
-
-    Raises:
-        UsageError: a chosen frame of a clip is not one of them.
-    """
-    sources = inputs.sources
-    clips = sorted(sources["clips"], key=lambda clip: sources["clips"][clip][0])
-    placed = {clip: inputs.open(f"triangulation/{clip}") for clip in clips}
-    frames = {clip: placed[clip]["frame"].values for clip in clips}
-    total = sum(count for _, count in sources["clips"].values())
-    stride = triangulation_settings(inputs, clips[0]).stride(total)
-    for clip in clips:
-        start, count = sources["clips"][clip]
+def _require_computed(
+    settings: BundleAdjustmentSettings,
+    spans: Mapping[str, tuple[int, int]],
+    frames: Mapping[str, NDArray[np.int64]],
+    stride: int,
+) -> None:
+    """Refuse chosen frames of clips that the first triangulation did not compute."""
+    for clip, known in frames.items():
+        start, count = spans[clip]
         inside = [frame for frame in settings.chosen_frames if 0 <= frame - start < count]
-        between = np.setdiff1d(inside, frames[clip])
+        between = np.setdiff1d(inside, known)
         if len(between):
+            total = sum(count for _, count in spans.values())
             raise UsageError(
                 "bundle_adjustment.chosen_frames",
                 expected=f"frames of clip {clip} that the first triangulation computed: "
@@ -87,51 +78,37 @@ def _open_people(inputs: UnitInputs, settings: BundleAdjustmentSettings) -> _Peo
                 found=f"{between[0]:.0f}",
                 todo=f"Choose from these, or set triangulation.max_frames={total}.",
             )
+
+
+def _read_people(
+    inputs: UnitInputs, placed: Mapping[str, xr.Dataset]
+) -> tuple[NDArray[np.int64], NDArray[np.int16], Floats, NDArray[np.int64]]:
+    """Read tracks and joints in the frames of all clips that were triangulated first.
+
+    Returns:
+        (persons,) ids, the same of which in two clips can be two people, and no code here
+        identifies them; their detections (frames, cameras, persons); their joints (frames, persons,
+        17, 3) [m], world; and views (frames, persons, 17).
+    """
     tracked = [
-        select_triangulated(select_frames(inputs.open(f"tracking/{clip}"), frame))
-        for clip, frame in frames.items()
+        select_triangulated(select_frames(inputs.open(f"tracking/{clip}"), found["frame"].values))
+        for clip, found in placed.items()
     ]
     person = np.unique(np.concatenate([tracks["person"].values for tracks in tracked]))
-    number = sum(map(len, frames.values()))
-    count = len(sources["cameras"])
-    people = _People(
-        clip_frames=frames,
-        fps=float(sources["fps"]) / stride,
-        person=person,
-        detection_index=np.full((number, count, len(person)), -1, dtype=np.int16),
-        joints=np.full((number, len(person), 17, 3), np.nan),
-        views=np.zeros((number, len(person), 17), dtype=np.int64),
-    )
+    number = sum(found.sizes["frame"] for found in placed.values())
+    index = np.full((number, len(inputs.sources["cameras"]), len(person)), -1, dtype=np.int16)
+    joints = np.full((number, len(person), 17, 3), np.nan)
+    views = np.zeros((number, len(person), 17), dtype=np.int64)
     last = 0
     for tracks, found in zip(tracked, placed.values(), strict=True):
         rows = np.arange(last, last := last + tracks.sizes["frame"])[:, None]
         columns = np.searchsorted(person, tracks["person"].values)
-        people.detection_index[rows, :, columns] = (
+        index[rows, :, columns] = (
             tracks["detection_index"].transpose("frame", "person", "camera").values
         )
-        people.joints[rows, columns] = found["joints"].values
-        people.views[rows, columns] = found["views"].values
-    return people
-
-
-def _open_clip(inputs: UnitInputs, people: _People, opened: ClipInputs) -> Clip:
-    """Return the calibrated cameras, their clicks, and their detections of `people`."""
-    pitch = opened.raise_pitch(inputs.pitch)
-    covariance = open_venue(inputs, opened.camera_ids).covariance
-    known = [inputs.open(f"static_calibration/{camera}") for camera in opened.camera_ids]
-    return Clip(
-        cameras=opened.cameras,
-        covariance=np.where(np.isfinite(covariance), covariance, 0.0),  # 0 = a given camera
-        clicks=tuple(_clicks(camera, pitch) for camera in known),
-        fps=people.fps,
-        detections=opened.detections[:].assign_people(people.detection_index),
-        joints=people.joints,
-        views=people.views,
-        triangulation=triangulation_settings(inputs, next(iter(people.clip_frames))),
-        pitch=pitch,
-        on_lines=np.array([camera.attrs["origin"] == "lines" for camera in known]),
-        names=tuple(opened.camera_ids),
-    )
+        joints[rows, columns] = found["joints"].values
+        views[rows, columns] = found["views"].values
+    return person, index, joints, views
 
 
 def _clicks(known: xr.Dataset, pitch: PitchTemplate | None) -> Clicks:

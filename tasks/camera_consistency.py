@@ -67,11 +67,7 @@ def camera_consistency(inputs: UnitInputs, result: ResultWriter) -> None:
 
 
 def _doubt_calibration(inputs: UnitInputs, clip: ClipInputs, found: Consistency) -> str:
-    """Return a warning of a calibration that people of most cameras, or stills, contradict.
-
-    Raises:
-        InputError: both contradict it.
-    """
+    """Return a warning of a calibration that people of most cameras, or stills, contradict."""
     names, folder = clip.camera_ids, Path(inputs.work.folder)
     alone, shares = "", {}
     if found.strangers:

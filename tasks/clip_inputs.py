@@ -56,14 +56,9 @@ class PagedArray:
         page: int = PAGE,
         pages: int | None = None,
     ) -> None:
-        """Open an array of a shape, whose rows `read` returns.
+        """Open an array of a shape, whose rows `read` returns, as numbers of `dtype`.
 
-        Args:
-            shape: (frames, ...).
-            read: returns the rows from a start to a stop.
-            dtype: type of the numbers that it gives.
-            page: rows per read.
-            pages: pages in memory; None = all of a small array, else `PAGES`.
+        It is read by `page` rows, of which `pages` stay in memory; None = all of a small array.
         """
         self.shape = shape
         self._dtype, self._rows = np.dtype(dtype), page

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from data_contracts.arrays import Image, Singles
@@ -40,52 +40,34 @@ def detection(inputs: UnitInputs, result: ResultWriter) -> None:
     edits = TypeAdapter(list[DetectionEdit]).validate_python(inputs.sources.get("edits") or [])
     with inputs.open_spool() as spool:
         found = _open_uncorrected(inputs) if edits else None
-        found = found or _detect_people(inputs, spool)
-        result.figures |= found.figures | _longest_gap(found.unreadable)
-        result.warnings += found.warnings
-        detections, objections = found.detections, {}
+        detections, images, unreadable, figures, warnings = found or _detect_people(inputs, spool)
+        result.figures |= figures
+        if unreadable:
+            first, last = max(unreadable, key=lambda gap: gap[1] - gap[0])
+            result.figures |= {"unreadable_from_frame": first, "unreadable_to_frame": last}
+        result.warnings += warnings
+        objections = {}
         if edits:
             replay = replay_detections(detections, edits)
             detections, objections = replay.observations, {"objections": [*replay.objections]}
             result.figures["corrections_refused"] = float(sum(map(bool, replay.objections)))
         result.write(
             DETECTION,
-            arrays=detections.arrays() | found.images,
+            arrays=detections.arrays() | images,
             coordinates={"frame": detections.frame},
             attributes={
                 "camera_id": inputs.sources["camera"],
-                "unreadable": found.unreadable,
+                "unreadable": unreadable,
                 **objections,
                 **detections.labels(),
             },
         )
 
 
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """Output of the detection nets.
-
-    Attributes:
-        detections: detected people.
-        images: `IMAGE_ARRAYS` of the frames, by name.
-        unreadable: [first, last] of each interval of frames without an image.
-        figures: metrics.
-        warnings: sentences of the unit.
-    """
-
-    detections: KeypointDetections
-    images: dict[str, Singles]
-    unreadable: list[list[int]]
-    figures: dict[str, float]
-    warnings: Sequence[str]
-
-
-def _longest_gap(unreadable: list[list[int]]) -> dict[str, float]:
-    """Return the first and last frame of the longest time without an image; empty if none."""
-    if not unreadable:
-        return {}
-    first, last = max(unreadable, key=lambda gap: gap[1] - gap[0])
-    return {"unreadable_from_frame": first, "unreadable_to_frame": last}
+_Found = tuple[
+    KeypointDetections, dict[str, Singles], list[list[int]], dict[str, float], Sequence[str]
+]
+"""People; `IMAGE_ARRAYS` by name; [first, last] of frames without an image; metrics; warnings."""
 
 
 def _warn_of_size(detections: KeypointDetections, settings: DetectionSettings) -> list[str]:
@@ -113,9 +95,7 @@ def _open_uncorrected(inputs: UnitInputs) -> _Found | None:
     stored, manifest = published
     detections = KeypointDetections.from_arrays(stored)
     images = {array.name: stored[array.name].values for array in IMAGE_ARRAYS}
-    return _Found(
-        detections, images, stored.attrs["unreadable"], dict(manifest.figures), manifest.warnings
-    )
+    return detections, images, stored.attrs["unreadable"], manifest.figures, manifest.warnings
 
 
 def _detect_people(inputs: UnitInputs, spool: Spool) -> _Found:
@@ -143,7 +123,8 @@ def _detect_people(inputs: UnitInputs, spool: Spool) -> _Found:
             f"in {report.cut} frames, people beyond the {settings.max_people} of "
             "detection.max_people were left out"
         )
-    if len(unreadable) == report.frames and not _has_images(inputs):
+    if len(unreadable) == report.frames and not (_pictures(inputs) >= 0).any():
+        # A camera may film other clips alone.
         unreadable, told = [], ["the camera does not film this clip"]
     elif len(unreadable) == report.frames:
         raise InputError(
@@ -160,7 +141,7 @@ def _detect_people(inputs: UnitInputs, spool: Spool) -> _Found:
         }
     )
     told += [] if report.is_given else _warn_of_size(detections, settings)
-    return _Found(
+    return (
         detections,
         {
             array.name: np.array(values, dtype=np.float32)
@@ -184,11 +165,10 @@ def _detect_people(inputs: UnitInputs, spool: Spool) -> _Found:
     )
 
 
-def _has_images(inputs: UnitInputs) -> bool:
-    """Return whether the video shows the clip at all: a camera may film other clips alone."""
+def _pictures(inputs: UnitInputs) -> NDArray[np.integer]:
+    """Return the picture of the video in each frame of the clip; -1 = none."""
     footage, frames = inputs.open(f"ingest/{inputs.sources['camera']}"), inputs.frames
-    pictures = footage["picture_of_frame"].sel(frame=slice(frames[0], frames[-1])).values
-    return bool((pictures >= 0).any())
+    return footage["picture_of_frame"].sel(frame=slice(frames[0], frames[-1])).values
 
 
 def _given_people(inputs: UnitInputs) -> dict[int, People]:
@@ -197,12 +177,10 @@ def _given_people(inputs: UnitInputs) -> dict[int, People]:
     Raises:
         InputError: the file is invalid, or not the registered one.
     """
-    footage = inputs.open(f"ingest/{inputs.sources['camera']}")
-    index = footage_index(footage)
+    index = footage_index(inputs.open(f"ingest/{inputs.sources['camera']}"))
     given = read_boxes(inputs.file("boxes"), index.size, len(index))
     inputs.require_registered("boxes")
-    frames = inputs.frames
-    pictures = footage["picture_of_frame"].sel(frame=slice(frames[0], frames[-1])).values
+    frames, pictures = inputs.frames, _pictures(inputs)
     begins = np.searchsorted(given.frame, pictures, side="left")
     ends = np.searchsorted(given.frame, pictures, side="right")
     return {
@@ -219,11 +197,10 @@ def _read_frames(
 
     Brightness and sharpness of each are added to `quality`.
     """
-    footage, frames = inputs.open(f"ingest/{inputs.sources['camera']}"), inputs.frames
-    numbers = footage["picture_of_frame"].sel(frame=slice(frames[0], frames[-1])).values
-    with open_video(inputs.file("video"), footage_index(footage)) as video:
-        shown = readable_at(video, numbers)
-        for frame, picture in zip(frames.tolist(), shown, strict=True):
+    index = footage_index(inputs.open(f"ingest/{inputs.sources['camera']}"))
+    with open_video(inputs.file("video"), index) as video:
+        shown = readable_at(video, _pictures(inputs))
+        for frame, picture in zip(inputs.frames.tolist(), shown, strict=True):
             quality.append(measure_image(picture))
             yield frame, picture
 
@@ -240,8 +217,7 @@ def footage_index(footage: xr.Dataset) -> FrameIndex:
     """Return the frame index of a video, as `ingest` stored it."""
     video = footage.attrs["video"]
     width, height = video["size"]
-    base = video["time_base"]
-    time_base = None if base is None else Fraction(base[0], base[1])
+    time_base = None if video["time_base"] is None else Fraction(*video["time_base"])
     return FrameIndex(
         footage["picture_stamp"].values,
         footage["picture_key"].values,
@@ -263,11 +239,7 @@ def _open_place(inputs: UnitInputs) -> Place | None:
 
 
 def require_weights(settings: DetectionSettings, planned: dict[str, str | None]) -> None:
-    """Refuse weights or libraries that differ from the run plan.
-
-    Raises:
-        InputError: weights or libraries differ.
-    """
+    """Refuse weights or libraries that differ from the run plan."""
     found = weights_of(settings)
     if found != planned:
         names = sorted(name for name in planned if found.get(name) != planned[name])

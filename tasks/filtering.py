@@ -85,7 +85,7 @@ def filtering(inputs: UnitInputs, result: ResultWriter) -> None:
     frame, camera_ids = case.clip.detections.frame, case.clip.camera_ids
     most = min(len(frame), settings.max_held_out_frames)
     chosen = np.unique(np.linspace(0, len(frame) - 1, most).astype(np.int64))
-    views, motion, suspects = case.at(chosen)
+    (views, motion), suspects = case.project(chosen), case.read(chosen)
     fps = case.clip.fps * len(chosen) / len(frame)
     joints, _, _ = case.bodies.read(chosen)
     systematic = learn_systematic_errors(
@@ -104,7 +104,15 @@ def filtering(inputs: UnitInputs, result: ResultWriter) -> None:
         shift = systematic.shift(motion, views)
         placed = suspects.subtract_clock_offsets(held, motion.image_motion)
         judged = judge_detections(views, placed.subtract(shift), spread, settings)
-        return _part_arrays(judged, suspects, shift), *_counts(judged, suspects)
+        arrays = {
+            "rejected": judged.rejected,
+            "surprise": judged.mahalanobis_distance,
+            "dropped": judged.dropped,
+            "fits": judged.fits,
+            "similarity": judged.similarity,
+            "shift": suspects.assign_to_detections(shift).astype(np.float32),
+        }
+        return arrays, *_counts(judged, suspects)
 
     with inputs.open_spool() as spool:
         # Read here: two threads would both read the page in which their parts meet.
@@ -172,11 +180,9 @@ class _Case:
 
     Attributes:
         clip: all detections, without earlier rejections, of tracked people.
-        bodies: the bodies.
         placed: arrays `PLACED` of `retriangulation`.
         dropped: (frames, cameras, detections), boxes that the previous iteration dropped; None in
             the first.
-        triangulation: settings of the triangulation.
     """
 
     clip: ClipInputs
@@ -189,10 +195,6 @@ class _Case:
     def first(self) -> bool:
         """Whether this is the first iteration, without shifted keypoints."""
         return self.dropped is None
-
-    def at(self, frames: NDArray[np.int64]) -> tuple[BodyViews, BodyMotion, TriangulatedDetections]:
-        """Project the bodies into all images; return views, motion, and the detections to test."""
-        return *self.project(frames), self.read(frames)
 
     def parts(self) -> Iterator[_Part]:
         """Yield all frames, `PART` at a time, with their detections."""
@@ -235,20 +237,6 @@ def _open_case(inputs: UnitInputs) -> _Case:
     )
 
 
-def _part_arrays(
-    judged: Judgement, suspects: TriangulatedDetections, shift: Floats
-) -> dict[str, NDArray[Any]]:
-    """Return the stored arrays with a frame dimension."""
-    return {
-        "rejected": judged.rejected,
-        "surprise": judged.mahalanobis_distance,
-        "dropped": judged.dropped,
-        "fits": judged.fits,
-        "similarity": judged.similarity,
-        "shift": suspects.assign_to_detections(shift).astype(np.float32),
-    }
-
-
 def _counts(
     judged: Judgement, suspects: TriangulatedDetections
 ) -> tuple[list[float], list[Floats]]:
@@ -282,12 +270,6 @@ def _held_out(
 
     The systematic errors of cameras are estimated in every iteration, and redetected people are not
     evaluated, so that iterations are comparable.
-
-    Args:
-        inputs: the unit.
-        case: the clip and its bodies.
-        frames: the frames to measure in.
-        suspects: their detections.
     """
     used, keypoints = suspects.detections, suspects.detections.keypoints
     if not case.first:
@@ -330,7 +312,6 @@ class _CameraCase:
         surface: crown and end fall of the pitch that the cameras show [m]; None = as in pitch.json.
         detection: what the detections were computed from.
         detected: the people of `detection` (frames, detections).
-        person: (persons,) ids.
         expected: the bodies in the camera's images, which follow its changes; NaN if left out.
         shift: (frames, persons, 17, 2) [px], systematic error of keypoints relative to joints.
         seen: (frames, persons), detected people; all people in corrected frames.

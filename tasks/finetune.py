@@ -28,15 +28,9 @@ def finetune(
 ) -> NetVersion:
     """Train a net, write `<kind>-<fingerprint>.safetensors` and `.json`; return the record.
 
-    A retry, or the same call after a kill, resumes from the last checkpoint.
-
-    Args:
-        kind: net to train.
-        annotations: COCO keypoints.
-        pictures: the folder of their images; that of the annotations if None.
-        folder: folder of the versions.
-        settings: steps, learning rate, sampling shares of images, seed.
-        start: initial weights; the shipped ones if None.
+    A retry, or the same call after a kill, resumes from the last checkpoint. The annotations are
+    COCO keypoints, of images in `pictures` or else beside them; `start` are the initial weights, if
+    not the shipped ones.
     """
     from worldpose.training.fine_tuning import NET_METRICS, fine_tune
 

@@ -27,24 +27,20 @@ from worldpose.store.writer import ResultWriter
 from worldpose.tracking.plane.feet import locate_feet
 from worldpose.video.folder import open_video
 
-_NOT_PROPOSED: Mapping[str, Any] = {
-    "drawn": {},
-    "markings": [],
-    **dict.fromkeys(("score", "margin", "found", "explained")),
-}
-
 
 @unit_task
 def proposal(inputs: UnitInputs, result: ResultWriter) -> None:
     """Write the camera, proposed from its image unless it is known, and people's places."""
     settings = inputs.settings(ProposalSettings)
-    attributes = {
+    attributes: dict[str, Any] = {
         "camera_id": inputs.unit,
         "fps": inputs.sources["fps"],
         "is_stated": True,
         "is_clear": True,
         "problem": None,
-        **_NOT_PROPOSED,
+        "drawn": {},
+        "markings": [],
+        **dict.fromkeys(("score", "margin", "found", "explained")),
     }
     pitch = inputs.pitch if "pitch" in inputs.sources else None
     try:

@@ -17,10 +17,10 @@ from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.body_fitting import REFITTING
 from data_contracts.keypoints import KeypointDetections
 from tasks.body_fitting import (
+    ClipPeople,
     FurtherArrays,
     find_same_body,
     frame_arrays,
-    open_people,
     write_fit,
 )
 from tasks.broadcast_calibration import BroadcastInputs, image_clock, open_broadcast
@@ -71,7 +71,7 @@ def _refit(inputs: UnitInputs, result: ResultWriter) -> None:
     stage = "broadcast_calibration/"
     names = sorted(name for name in inputs.recipe.inputs if name.startswith(stage))
     views = [_RefittedView.open(inputs, name.removeprefix(stage), fitted) for name in names]
-    people = open_people(inputs, views)
+    people = ClipPeople(inputs, views)
     known = _known_shapes(inputs, before, fitted, result)
     pooled = np.isin(np.arange(len(people.person)), list(known))
     recognised = 0
@@ -171,11 +171,8 @@ def _known_shapes(
 ) -> dict[int, Shape]:
     """Return the body shapes from other clips that can be the same person's, by person index.
 
-    Args:
-        inputs: the unit.
-        before: what `fitted` was computed from.
-        fitted: bodies of this clip.
-        result: gets a warning of every name of different people.
+    `before` is what `fitted`, the bodies of this clip, were made from. The result gets a warning of
+    every name of different people.
     """
     named: dict[str, dict[str, str]] = dict(inputs.sources["people"])
     here, own = named.pop(inputs.unit), _fitted_shapes(fitted)
@@ -296,11 +293,8 @@ def _calibration_covariance(
 ) -> Floats:
     """Return the covariance (frames, persons, 2, 2) [m^2] of places by the calibration alone.
 
-    Args:
-        cameras: batch (frames,).
-        covariance: (frames, 12, 12) of each frame's camera.
-        pitch: surface.
-        place: (frames, persons, 2) [m].
+    The places (frames, persons, 2) [m] lie on the pitch; `covariance` (frames, 12, 12) is that of
+    each frame's camera.
     """
     out = np.zeros((*place.shape, 2))
     points = np.concatenate([place, pitch.height(place[..., 0], place[..., 1])[..., None]], axis=-1)

@@ -120,12 +120,7 @@ def _calibrate(inputs: UnitInputs) -> StaticCalibration:
 
 
 def _open_proposal(inputs: UnitInputs, pitch: PitchTemplate, where: str) -> Proposal:
-    """Return the camera's proposal on its side of the pitch.
-
-    Raises:
-        InputError: there is none, it is not clear, or people do not tell the side, or contradict
-            the stated one.
-    """
+    """Return the camera's proposal on its side of the pitch."""
     found = {name.partition("/")[2]: inputs.open(name) for name in inputs.recipe.inputs}
     own = found[inputs.unit]
     if own.attrs["origin"] == "none":
@@ -156,11 +151,7 @@ def given_lens(sources: Mapping[str, Any]) -> LensCalibration | None:
 
 
 def require_picture(camera_id: str, picture: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
-    """Return the camera's image.
-
-    Raises:
-        InputError: no image of its video can be read.
-    """
+    """Return the camera's image."""
     if picture is None:
         raise InputError(
             f"image of {camera_id}",
@@ -197,11 +188,7 @@ def open_still(inputs: UnitInputs) -> NDArray[np.uint8] | None:
 
 
 def _filmed_still(folder: Path, filmed: Mapping[str, Any]) -> NDArray[np.uint8]:
-    """Return the median of images evenly spaced over the clips; motionless people stay in it.
-
-    Raises:
-        InputError: the file differs from the registered one, or is not a video.
-    """
+    """Return the median of images evenly spaced over the clips; motionless people stay in it."""
     path = folder / filmed["video"]
     every = np.concatenate(
         [np.arange(first, first + count) for first, count in sorted(filmed["clips"].values())]

@@ -133,14 +133,9 @@ def stage_span(stage: str, units: int) -> Iterator[None]:
 def add_unit_span(
     unit: str, key: str, end: datetime, seconds: float, figures: Mapping[str, float]
 ) -> None:
-    """Add the span of a computed unit, below the current one.
+    """Add the span of a computed unit, `stage/unit`, below the current one.
 
-    Args:
-        unit: `stage/unit`.
-        key: key of its result.
-        end: time of publication.
-        seconds: computing time before it [s].
-        figures: its metrics; those of single cameras are left out.
+    It was published at its end, after these seconds [s]; metrics of single cameras are left out.
     """
     if not is_traced():
         return

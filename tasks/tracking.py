@@ -374,12 +374,9 @@ def _estimate_clocks(
     Triangulation estimates the clocks itself, and its people are at the times of the frames.
     """
     if np.isfinite(joints).any():
-        count = len(clip.camera_ids)
-        return PlaneClocks(
-            np.zeros(count), np.full(count, np.inf), 0, np.zeros(count, dtype=np.bool_)
-        )
-    size = (pitch.length, pitch.width)
-    return estimate_plane_clocks(positions, clip.fps, pitch_size=size)
+        none = np.zeros(len(clip.camera_ids))
+        return PlaneClocks(none, np.full(len(none), np.inf), 0, none > 0.0)
+    return estimate_plane_clocks(positions, clip.fps, pitch_size=(pitch.length, pitch.width))
 
 
 def _track_on_plane(

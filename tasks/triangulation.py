@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import reduce
 from operator import add
 from typing import Any, Final
@@ -30,7 +29,6 @@ from worldpose.camera_consistency.health import CameraHealth, judge_health, meas
 from worldpose.ingest.footage import stretches
 from worldpose.store.writer import ResultWriter
 from worldpose.triangulation.camera_changes import (
-    MeasuredChange,
     change_record,
     describe_change,
     explains_clock,
@@ -42,7 +40,7 @@ from worldpose.triangulation.camera_changes import (
 from worldpose.triangulation.change_sums import ChangeSums, Kind, choose_bins, sum_joints
 from worldpose.triangulation.estimate import learn_clip, reconstruct_chunks
 from worldpose.triangulation.person_offsets import stated_errors
-from worldpose.triangulation.results import DetectorModel, Smoothing, Triangulation
+from worldpose.triangulation.results import Smoothing, Triangulation
 from worldpose.triangulation.settings import TriangulationSettings
 
 UNHEALTHY: Final = "unhealthy_share"
@@ -87,10 +85,8 @@ def _write_joints(
     rows = np.arange(0, len(index), stride)
     _, cameras, persons = index.shape
     fps = clip.fps / stride
-    health, bins = (
-        CameraHealth.empty(len(rows), cameras, persons, fps),
-        choose_bins(len(rows) * cameras * persons, fps),
-    )
+    health = CameraHealth.empty(len(rows), cameras, persons, fps)
+    bins = choose_bins(len(rows) * cameras * persons, fps)
     stated = None
     if covariance is not None:
 
@@ -112,12 +108,14 @@ def _write_joints(
         equations = ChangeSums.join(sums, clip.cameras, fps)
         measured = _health_arrays(inputs, clip, health, equations, rows, result)
         found = _find_changes(inputs, clip, health, equations, kinds, rows, result)
+        bias = np.full(len(detections.points), settings.common_bias_m)
         result.write(
             layout,
             arrays=spool.arrays()
             | {"clock_late": model.clocks.late, "clock_error": model.clocks.standard_error}
             | measured
-            | _bias_arrays(model.detector, clip.detections.points, settings),
+            | {"common_bias": model.detector.common_bias}
+            | ({"extra_common_bias": bias} if len(bias) else {}),
             coordinates={"frame": detections.frame[::stride], "person": clip.person},
             attributes={
                 "camera": list(clip.camera_ids),
@@ -214,7 +212,12 @@ def _find_changes(
     known = known_changes(inputs, inputs.unit)
     found = find_changes(clip.cameras, clip.detections, sums.fps, rows, sums, kinds)
     if found and len(names) < 3:
-        warnings.append(_describe_pair(names, found[0], frame))
+        row = found[0].row
+        when = "slowly" if row is None else f"at frame {frame[row]}"
+        warnings.append(
+            f"cameras {' and '.join(names)} cease to agree {when}: one of them moved, or its clock "
+            "changed. Two cameras cannot tell which."
+        )
         return known
     new = list[CameraChange]()
     for measured in found:
@@ -243,15 +246,6 @@ def _find_changes(
     if len(names) - len(spoilt) < 3 < len(names):
         warnings.append(f"changes of other cameras can hide behind those of {', '.join(spoilt)}.")
     return [*known, *new]
-
-
-def _describe_pair(names: Sequence[str], found: MeasuredChange, frame: NDArray[np.integer]) -> str:
-    """Return a sentence about a change of two cameras, which cannot tell whose it is."""
-    when = "slowly" if found.row is None else f"at frame {frame[found.row]}"
-    return (
-        f"cameras {' and '.join(names)} cease to agree {when}: one of them moved, or its clock "
-        "changed. Two cameras cannot tell which."
-    )
 
 
 def camera_errors(inputs: UnitInputs, clip: ClipInputs) -> NDArray[np.float64] | None:
@@ -287,13 +281,3 @@ def _part_arrays(joints: Triangulation, smooth: Smoothing) -> dict[str, NDArray[
         "smoothed_covariance": smooth.covariance,
         "filled": smooth.filled,
     }
-
-
-def _bias_arrays(
-    detector: DetectorModel, points: tuple[str, ...], settings: TriangulationSettings
-) -> dict[str, NDArray[Any]]:
-    """Return the stored errors that all views share."""
-    arrays: dict[str, NDArray[Any]] = {"common_bias": detector.common_bias}
-    if points:
-        arrays["extra_common_bias"] = np.full(len(points), settings.common_bias_m)
-    return arrays

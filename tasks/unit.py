@@ -96,12 +96,7 @@ class Spool:
 
 @dataclass(frozen=True)
 class UnitInputs:
-    """What one unit is computed from.
-
-    Attributes:
-        store: store with its input results.
-        work: the work order.
-    """
+    """What one unit is computed from."""
 
     store: Store
     work: Work
@@ -194,13 +189,7 @@ class UnitInputs:
         return Path(self.work.folder, self.sources[name])
 
     def require_registered(self, name: str) -> None:
-        """Refuse the content of `file(name)` if it differs from the registered one.
-
-        Call it after reading, so that it detects changes in between.
-
-        Raises:
-            InputError: the file differs from the registered one.
-        """
+        """Refuse the content of `file(name)` as `require_registered`."""
         require_registered(self.file(name), self.sources[f"{name}_sha256"])
 
 
@@ -210,16 +199,6 @@ def unit_task(compute: Callable[[UnitInputs, ResultWriter], None]) -> Task[[Work
     The task takes the work order, and returns the key of the result.
     """
 
-    def publish(work: Work) -> str:
-        store = Store.open(work.project)
-        with store.publish(work) as result:
-            compute(UnitInputs(store, work), result)
-        return work.key
-
-    for name in ("__module__", "__name__", "__qualname__", "__doc__"):
-        setattr(publish, name, getattr(compute, name))
-
-    @functools.wraps(publish)
     def run_checked(work: Work) -> str:
         # A log line that Prefect's server rejects (a full disk) is not output of a worker.
         logging.raiseExceptions = False
@@ -228,7 +207,10 @@ def unit_task(compute: Callable[[UnitInputs, ResultWriter], None]) -> Task[[Work
         require_same_code(work, compute.__module__)
         with kill_on_timeout(work):
             try:
-                return publish(work)
+                store = Store.open(work.project)
+                with store.publish(work) as result:
+                    compute(UnitInputs(store, work), result)
+                return work.key
             except WorldposeError:
                 raise
             except Exception as error:
@@ -238,6 +220,8 @@ def unit_task(compute: Callable[[UnitInputs, ResultWriter], None]) -> Task[[Work
                 # A bug must not look like a fault of the match.
                 raise InternalError.wrap(work.recipe.name, error) from error
 
+    for name in ("__module__", "__name__", "__qualname__", "__doc__"):
+        setattr(run_checked, name, getattr(compute, name))
     return task(
         task_run_name="{work.recipe.stage} {work.recipe.unit}",
         retries=RETRIES,
@@ -264,15 +248,7 @@ def keep_freed_memory() -> None:
 
 
 def require_same_code(work: Work, module: str) -> None:
-    """Refuse to compute with other code than that of the key.
-
-    Args:
-        work: the work order.
-        module: module of its task.
-
-    Raises:
-        InputError: this process has other sources or libraries than the planning process.
-    """
+    """Refuse to compute with other code than that of the key."""
     recipe = work.recipe
     ours = {**code_version(module), **libraries()}
     theirs = {**recipe.code, **recipe.libraries}
@@ -312,9 +288,6 @@ def require_registered(path: Path, sha256: str) -> None:
     """Refuse the content of a match file or folder that differs from the registered one.
 
     Call it after reading, so that it detects changes in between.
-
-    Raises:
-        InputError: the file differs from the registered one.
     """
     if digest_of_files(path) != sha256:
         raise InputError(

@@ -17,7 +17,6 @@ from flows.cli.options import DEFAULT_PROJECT, given_options
 from worldpose.errors import UsageError
 
 if TYPE_CHECKING:
-    from flows.results.ablation import Score
     from flows.results.evaluation import Scores
 
 TableForm = Literal["text", "csv", "latex"]
@@ -267,41 +266,29 @@ def print_ablation(seeds: int) -> None:
         }
     )
     columns = ("", ">G-MPJPE", ">PA-MPJPE", ">ground m", ">clicks px")
+    figures = ("g_mpjpe_mm", "pa_mpjpe_mm", "ground_error_m", "marking_error_px")
+    hows = sorted((*TRIANGULATIONS, BY_PAPER), key=len, reverse=True)
     for clicks, found in trials.items():
-        for how in (*TRIANGULATIONS, BY_PAPER):
-            names = [row.removesuffix(how) for row in found[0] if _is_of(row, how)]
-            rows = [_row(name, [t[name + how] for t in found]) for name in names]
-            if rows:
-                print_table(f"{clicks}{how}: {seeds} trials, mm, mean ± spread", columns, rows)
+        # The longest of these that ends a row's name; our own has no suffix.
+        rows = {how: list[str]() for how in (*TRIANGULATIONS, BY_PAPER)}
+        for row in found[0]:
+            how = next(each for each in hows if row.endswith(each))
+            g, pa, ground, marking = (
+                np.array([getattr(trial[row], figure) for trial in found]) for figure in figures
+            )
+            rows[how].append(
+                f"{row.removesuffix(how)}\t{g.mean():.1f} ± {g.std():.1f}\t"
+                f"{pa.mean():.1f} ± {pa.std():.1f}\t{ground.mean():.3f}\t{marking.mean():.2f}"
+            )
+        for how, shown in rows.items():
+            if shown:
+                print_table(f"{clicks}{how}: {seeds} trials, mm, mean ± spread", columns, shown)
     published = [(name, f"{g:.1f}", f"{pa:.1f}") for name, (g, pa) in PAPER.items()]
     print_table("the paper's trial, real people, mm", ("", ">G-MPJPE", ">PA-MPJPE"), published)
 
 
-def _is_of(row: str, how: str) -> bool:
-    """Return whether an ablation's row ends with this way; our own has no suffix."""
-    from flows.results.ablation import BY_PAPER, TRIANGULATIONS
-
-    ends = (end for end in (*TRIANGULATIONS, BY_PAPER) if row.endswith(end))
-    return max(ends, key=len) == how
-
-
-def _row(name: str, scores: list[Score]) -> str:
-    g, pa, ground, marking = (
-        np.array([getattr(score, figure) for score in scores])
-        for figure in ("g_mpjpe_mm", "pa_mpjpe_mm", "ground_error_m", "marking_error_px")
-    )
-    return (
-        f"{name}\t{g.mean():.1f} ± {g.std():.1f}\t{pa.mean():.1f} ± {pa.std():.1f}\t"
-        f"{ground.mean():.3f}\t{marking.mean():.2f}"
-    )
-
-
 def named_rates(given: Sequence[str]) -> dict[str, float]:
-    """Parse NAME=FPS arguments into numbers by name.
-
-    Raises:
-        UsageError: an argument has another form.
-    """
+    """Parse NAME=FPS arguments into numbers by name."""
     rates = {}
     for item in given:
         name, _, text = item.partition("=")

@@ -9,13 +9,7 @@ import typer
 
 from flows.cli import console
 from flows.registering import find_registration
-from flows.results.comparison import (
-    KINDS,
-    SubjectChange,
-    compare_runs,
-    count_marks,
-    largest_pose_changes,
-)
+from flows.results.comparison import KINDS, compare_runs, count_marks, largest_pose_changes
 from flows.results.timings import run_time
 from flows.run_status import explain_unit, find_run, run_difference
 from flows.settings import parse_overrides
@@ -61,19 +55,7 @@ def diff(
         for change in changes
     ]
     console.print_table(f"{run_a} to {run_b}", ("unit", "result", "why", "metrics"), rows)
-    _print_compared(compared)
-    if pictures:
-        shown = (
-            f"{each.clip}\t{each.camera}\t{each.frame}\t{each.person}\t{each.moved_px:.2f}"
-            for each in pictures
-        )
-        title = "images with the largest changes of people"
-        console.print_table(title, "clip\tcamera\t>frame\t>person\t>px", shown)
-
-
-def _print_compared(compared: list[SubjectChange]) -> None:
-    """Print cameras, clips and players with the metrics that changed significantly."""
-    rows = [
+    shown = [
         (
             change.kind,
             change.name,
@@ -87,13 +69,19 @@ def _print_compared(compared: list[SubjectChange]) -> None:
         for change in compared
         if change.mark != "unchanged"
     ]
-    if rows:
-        console.print_table("better and worse", ("kind", "which", "is", "metrics"), rows)
+    if shown:
+        console.print_table("better and worse", ("kind", "which", "is", "metrics"), shown)
     for kind in KINDS:
-        marks = count_marks(compared, kind)
+        marks = sorted(count_marks(compared, kind).items())
         if marks:
-            each = ", ".join(f"{count} {mark}" for mark, count in sorted(marks.items()))
-            console.line(f"{kind}: {each}")
+            console.line(f"{kind}: {', '.join(f'{count} {mark}' for mark, count in marks)}")
+    if pictures:
+        moved = (
+            f"{each.clip}\t{each.camera}\t{each.frame}\t{each.person}\t{each.moved_px:.2f}"
+            for each in pictures
+        )
+        title = "images with the largest changes of people"
+        console.print_table(title, "clip\tcamera\t>frame\t>person\t>px", moved)
 
 
 def why(
@@ -113,8 +101,8 @@ def why(
         unit: A unit, as MATCH/STAGE/UNIT.
     """
     found = explain_unit(store, unit, parse_overrides(more_settings or []))
-    reasons = (f"  {reason}" for reason in found.reasons)
-    console.answer(asdict(found), f"{found.unit}: {found.state}", *reasons)
+    reasons = (f"  {reason}" for reason in found["reasons"])
+    console.answer(found, f"{found['unit']}: {found['state']}", *reasons)
 
 
 def timings(store: Store, match: str, run: str = "latest") -> None:

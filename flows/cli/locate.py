@@ -296,11 +296,7 @@ def synchronize(
 
 
 def compute_poses(store: Store, match: Match, workers: int | None, *parts: RunRequest) -> Run:
-    """Compute parts of the method, up to the 2D poses, with the gates of the match's other runs.
-
-    Raises:
-        InputError: another process runs the match, or results must be reviewed first.
-    """
+    """Compute parts of the method, up to the 2D poses, with the gates of the match's other runs."""
     with alone_with(store, match.match_id):
         for part in parts:
             record = run_match(store, match, replace(part, workers=workers))

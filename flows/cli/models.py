@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.progress import BarColumn, DownloadColumn, Progress
@@ -31,24 +31,34 @@ def list_models(catalog: Path | None = None, folder: Path | None = None) -> None
     there = _read_all_pulled(place)
     for name, pulled in there.items():
         known.setdefault(name, pulled)
-    rows = [_describe(each, each.name in there) for each in known.values()]
+    rows: list[dict[str, Any]] = []
+    for each in known.values():
+        sizes = [file.size for file in each.files if file.size is not None]
+        rows.append(
+            {
+                "name": each.name,
+                "setting": _setting_for(each),
+                "bytes": sum(sizes) if sizes else None,
+                "licence": each.licence,
+                "pulled": each.name in there,
+                "about": each.about,
+                "files": [file.model_dump(exclude_none=True) for file in each.files],
+            }
+        )
     print_json({"folder": str(place), "models": rows})
     columns = ("name", "setting", ">MB", "licence", "pulled", "what it is")
-    print_table(
-        f"checkpoints; pulled ones lie in {place}",
-        columns,
-        [
-            (
-                each.name,
-                _setting_for(each),
-                f"{(_size(each) or 0) / 1e6:.0f}" if _size(each) else "-",
-                each.licence,
-                "yes" if each.name in there else "no",
-                each.about,
-            )
-            for each in known.values()
-        ],
+    shown = (
+        (
+            row["name"],
+            row["setting"],
+            f"{row['bytes'] / 1e6:.0f}" if row["bytes"] else "-",
+            row["licence"],
+            "yes" if row["pulled"] else "no",
+            row["about"],
+        )
+        for row in rows
     )
+    print_table(f"checkpoints; pulled ones lie in {place}", columns, shown)
 
 
 def _read_all_pulled(place: Path) -> dict[str, Checkpoint]:
@@ -60,24 +70,6 @@ def _read_all_pulled(place: Path) -> dict[str, Checkpoint]:
 
 def _setting_for(checkpoint: Checkpoint) -> str:
     return f"{SETTING[checkpoint.task]}=model:{checkpoint.name}"
-
-
-def _size(checkpoint: Checkpoint) -> int | None:
-    """Return the bytes of the files whose size is known; None if none is."""
-    sizes = [file.size for file in checkpoint.files if file.size is not None]
-    return sum(sizes) if sizes else None
-
-
-def _describe(checkpoint: Checkpoint, is_pulled: bool) -> dict[str, object]:
-    return {
-        "name": checkpoint.name,
-        "setting": _setting_for(checkpoint),
-        "bytes": _size(checkpoint),
-        "licence": checkpoint.licence,
-        "pulled": is_pulled,
-        "about": checkpoint.about,
-        "files": [file.model_dump(exclude_none=True) for file in checkpoint.files],
-    }
 
 
 @commands.command(name="pull")

@@ -146,11 +146,7 @@ def command_of(function: Callable[..., None]) -> Callable[..., None]:
 
 
 def require_answer(project: str) -> None:
-    """Refuse a project whose disk does not answer.
-
-    Raises:
-        InputError: there is no answer, not even that there is no project.
-    """
+    """Refuse a project whose disk does not answer."""
     from flows.service.layout import DISK_SECONDS, disk_answers  # late: it imports pydantic
 
     file = Path(project).expanduser() / "project.json"
@@ -173,11 +169,7 @@ def given_options(command: Callable[..., None], values: Mapping[str, object]) ->
 
 
 def certificate_and_key(certificate: Path | None, key: Path | None) -> tuple[Path, Path] | None:
-    """Return both files, or None if neither is given.
-
-    Raises:
-        UsageError: only one of them is given, or other users can read or write the key.
-    """
+    """Return both files, or None if neither is given."""
     if certificate is not None and key is not None:
         require_private_key(key)
         return certificate, key
@@ -192,11 +184,7 @@ def certificate_and_key(certificate: Path | None, key: Path | None) -> tuple[Pat
 
 
 def require_private_key(key: Path) -> None:
-    """Refuse a key that others than its owner can read; root's may be readable by a group.
-
-    Raises:
-        UsageError: there is no such file, or it has other rights.
-    """
+    """Refuse a key that others than its owner can read; root's may be readable by a group."""
     try:
         found = key.stat()
     except OSError as error:

@@ -57,7 +57,7 @@ def export(
         video: With viewer, also embed the clip's overlay video.
     """
     from flows.registering import find_registration, open_match
-    from flows.results.best_results import Footage, Origin, describe_age, open_results
+    from flows.results.best_results import Origin, describe_age, open_results
     from flows.results.export import LENS_ERRORS
     from flows.results.export import export as export_formats
     from flows.results.export import release as write_release
@@ -94,7 +94,7 @@ def export(
         filled=filled,
         surface=surface,
         definition=definition or "detector",
-        footage=Footage(store, open_match(store, name)) if video else None,
+        footage=(store, open_match(store, name)) if video else None,
         licence=None if licence is None else read_licence(licence),
     )
     if release is None or origin.licence is None:

@@ -69,8 +69,13 @@ def list_reviews(
             _tell_damage(opened)
     shown = [each for each in found if everything or each.state == "waits"]
     console.print_json({"reviews": [review_json(each) for each in shown], "problems": problems})
-    if shown or not problems:
-        _print_list(shown)
+    if not shown and not problems:
+        console.line("nothing waits for review")
+    for each in shown:
+        request = each.request
+        console.line(f"{request.id}  {each.state}, {request.match_id}, {when(request.created_at)}")
+        for reason in request.reasons:
+            console.line(f"  {reason_words(reason)}")
     if match and problems:
         raise typer.Exit(1)
 
@@ -416,17 +421,6 @@ def _places(
     return places
 
 
-def _print_list(shown: list[Review]) -> None:
-    """Print review requests, each with its state and reasons."""
-    if not shown:
-        console.line("nothing waits for review")
-    for each in shown:
-        request = each.request
-        console.line(f"{request.id}  {each.state}, {request.match_id}, {when(request.created_at)}")
-        for reason in request.reasons:
-            console.line(f"  {reason_words(reason)}")
-
-
 def _print_review(shown: Review) -> None:
     """Print one review request, its verdict, and all metrics."""
     console.print_json(review_json(shown))
@@ -440,13 +434,9 @@ def _print_review(shown: Review) -> None:
         console.line(f"  {decision.why or '(no reason given)'}")
     for unit, key in request.keys.items():
         console.line(f"  {unit} {key}, run {request.run_id}")
-    console.print_table("metrics", ("metric", ">value", "unit"), _metric_rows(shown))
-
-
-def _metric_rows(shown: Review) -> list[tuple[str, str, str]]:
     rows = []
-    for key, value in sorted(shown.request.figures.items()):
+    for key, value in sorted(request.figures.items()):
         name, _, part = key.partition(".")
         words, unit = metric_words(name)
         rows.append((f"{words} {part}".rstrip(), f"{value:.4g}", unit))
-    return rows
+    console.print_table("metrics", ("metric", ">value", "unit"), rows)

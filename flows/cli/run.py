@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Set
+from collections.abc import Set
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
@@ -29,7 +29,6 @@ from flows.run_record import alone_with
 from flows.run_status import RunStatus
 from flows.running import RunRequest, run_match, settle
 from flows.settings import parse_overrides, parse_time_limits, selected_stages
-from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.store.store import Run, Store
 
@@ -107,7 +106,12 @@ def run(
             most = request.most_iterations
             passes = None if most == 1 else iterate_match(store, opened, request, most)
             record = run_match(store, opened, request) if passes is None else passes.record
-            exported, problem = _export(store, opened, record)
+            exported: list[Path] = []
+            problem: Exception | None = None
+            try:
+                exported = export_after_run(store, opened, record)
+            except (WorldposeError, OSError) as error:
+                problem = error
     seconds = time.monotonic() - started
     warned = [
         *record.warnings,
@@ -151,16 +155,6 @@ def run(
     raise typer.Exit(EXIT_CODES[record.state] if problem is None else 1)
 
 
-def _export(
-    store: Store, match: Match, record: RunRecord
-) -> tuple[list[Path], WorldposeError | OSError | None]:
-    """Write the exports that settings ask for; return their files, or why there are none."""
-    try:
-        return export_after_run(store, match, record), None
-    except (WorldposeError, OSError) as error:
-        return [], error
-
-
 def _print(record: RunRecord, project: str, seconds: float) -> None:
     by = " until the review" if record.waiting and not record.failed else " by that"
     blocked = f" and {len(record.blocked)} blocked{by}" if record.blocked else ""
@@ -172,7 +166,15 @@ def _print(record: RunRecord, project: str, seconds: float) -> None:
     count = len(record.usability.reservations)
     verdict = f"{record.usability.verdict}{f' ({count} below)' if count else ''}"
     console.line(f"the results are {verdict}")
-    _print_waiting(record)
+    if record.waiting:
+        undecided = sum(not unit.rejected for unit in record.waiting)
+        rejected = len(record.waiting) - undecided
+        also = f", {rejected} rejected and to be corrected" if rejected else ""
+        console.line(f"{undecided} {'review' if undecided == 1 else 'reviews'} pending{also}:")
+        for unit in record.waiting[:MAX_LISTED]:
+            console.line(f"  {unit.request}: {all_reasons(unit.reasons)}")
+        if len(record.waiting) > MAX_LISTED:
+            console.line(f"  and {len(record.waiting) - MAX_LISTED} more")
     key = "median_stature_m"
     statures = [each[key] for each in record.figures.values() if key in each]
     if statures:
@@ -195,26 +197,8 @@ def _next_command(record: RunRecord) -> str:
     return f"worldpose run {record.match_id}, for the stages after these"
 
 
-def _print_waiting(record: RunRecord) -> None:
-    """Print the units that need review."""
-    if not record.waiting:
-        return
-    undecided = sum(not unit.rejected for unit in record.waiting)
-    rejected = len(record.waiting) - undecided
-    also = f", {rejected} rejected and to be corrected" if rejected else ""
-    console.line(f"{undecided} {'review' if undecided == 1 else 'reviews'} pending{also}:")
-    for unit in record.waiting[:MAX_LISTED]:
-        console.line(f"  {unit.request}: {all_reasons(unit.reasons)}")
-    if len(record.waiting) > MAX_LISTED:
-        console.line(f"  and {len(record.waiting) - MAX_LISTED} more")
-
-
 def parse_iterations(text: str) -> int | Literal["auto"]:
-    """Return the number of iterations, or `auto`.
-
-    Raises:
-        UsageError: the text is neither a number from 1 nor `auto`.
-    """
+    """Return the number of iterations, or `auto`."""
     if text == "auto":
         return "auto"
     if text.isascii() and text.isdigit() and int(text) > 0:
@@ -232,9 +216,13 @@ def figures_of(iteration: Iteration) -> dict[str, float | None]:
     record = iteration.record
     judged = _total(record, "filtering", "judged")
     rejected = _total(record, "filtering", "keypoints_rejected")
-    reprojection = [
-        value for name, value in _last_bodies(record).items() if ".reprojection_px." in name
-    ]
+    bodies: dict[str, float] = {}
+    for stage in ("body_fitting", "refitting"):  # of refitted bodies if available
+        for unit, figures in record.figures.items():
+            if unit.startswith(f"{stage}/"):
+                clip = unit.partition("/")[2]
+                bodies |= {f"{clip}.{name}": value for name, value in figures.items()}
+    reprojection = [value for name, value in bodies.items() if ".reprojection_px." in name]
     return {
         "held_out_error": iteration.held_out_error,
         "rejected_share": rejected / judged if judged else None,
@@ -252,16 +240,18 @@ def marks_of(store: Store, found: Iterations) -> Marks:
     # Imported here: it takes 0.7 s, before Prefect and Dask can start, and few runs iterate.
     from flows.results.comparison import KINDS, compare_runs, count_marks
 
+    shown: tuple[Mark, ...] = ("better", "worse", "mixed", "unchanged")
     marks: Marks = [{}]
     for before, after in pairwise(found.passes):
         changes = compare_runs(store, before.record, after.record)
-        marks.append({kind: _in_short(count_marks(changes, kind)) for kind in KINDS})
+        counts = {kind: count_marks(changes, kind) for kind in KINDS}
+        marks.append(
+            {
+                kind: " / ".join(str(own.get(mark, 0)) for mark in shown)
+                for kind, own in counts.items()
+            }
+        )
     return marks
-
-
-def _in_short(marks: Mapping[Mark, int]) -> str:
-    shown: tuple[Mark, ...] = ("better", "worse", "mixed", "unchanged")
-    return " / ".join(str(marks.get(mark, 0)) for mark in shown)
 
 
 def _iterations_json(found: Iterations, marks: Marks) -> dict[str, JsonValue]:
@@ -292,9 +282,8 @@ def print_iterations(found: Iterations, marks: Marks) -> None:
     rows += [(f"{kind}: b/w/m/u", *(each.get(kind, "") for each in marks)) for kind in kinds]
     heads = [f"{each.number} (run {each.record.run_id})" for each in found.passes]
     console.print_table("iterations", ("metric", *heads), rows)
-    console.line(
-        "b/w/m/u: better, worse, mixed, unchanged against the iteration before (worldpose diff)"
-    )
+    signs = "better, worse, mixed, unchanged"
+    console.line(f"b/w/m/u: {signs} against the iteration before (worldpose diff)")
     console.line(
         f"iteration {found.kept.number} stands, as run {found.record.run_id}: {found.ended}; "
         "a later one is kept only if people are foreseen better in cameras left out"
@@ -307,17 +296,6 @@ def _total(record: RunRecord, stage: str, name: str) -> float:
         for unit, figures in record.figures.items()
         if unit.startswith(f"{stage}/")
     )
-
-
-def _last_bodies(record: RunRecord) -> dict[str, float]:
-    """Return the body metrics of all clips as `unit.metric`, of refitted bodies if available."""
-    found: dict[str, float] = {}
-    for stage in ("body_fitting", "refitting"):
-        for unit, figures in record.figures.items():
-            if unit.startswith(f"{stage}/"):
-                clip = unit.partition("/")[2]
-                found |= {f"{clip}.{name}": value for name, value in figures.items()}
-    return found
 
 
 def reprocess(
@@ -397,7 +375,8 @@ def _nothing_to_do(each: Reprocessed) -> str:
 def _print_units(status: RunStatus) -> None:
     rows = []
     for unit in status.units:
-        name = unit.unit if status.latest.iteration == 1 else f"{unit.iteration}: {unit.unit}"
+        name = unit.planned.name
+        name = name if status.latest.iteration == 1 else f"{unit.planned.iteration}: {name}"
         own = [str(reason) for reason in unit.own_reasons]
         more = [f"and {len(own) - MAX_REASONS} more"] * (len(own) > MAX_REASONS)
         inputs = [f"changed inputs: {', '.join(unit.changed_inputs)}"] * bool(unit.changed_inputs)
@@ -417,8 +396,8 @@ def _outcome_json(each: Reprocessed) -> dict[str, JsonValue]:
         "to_compute": 0 if status is None else len(status.to_compute),
         "units": [
             {
-                "unit": unit.unit,
-                "iteration": unit.iteration,
+                "unit": unit.planned.name,
+                "iteration": unit.planned.iteration,
                 "state": unit.state.value,
                 "edited": bool(unit.own_reasons),
                 "reasons": list(unit.describe()),

@@ -96,12 +96,12 @@ def simulate(
         )
         foreign = FOREIGN_SCENARIOS[scenario]
         spec = simulate_foreign_match(foreign, seed, out, options, recordings)
-        _report_match(spec.match_id, out)
-        return
-    _refuse_options(f"scenario {scenario}", {"--recordings": recordings is not None})
-    with _show_rendering() as advance:
-        spec = simulate_match(SCENARIOS[scenario], seed, out, options, advance=advance)
-    _report_match(spec.match_id, out)
+    else:
+        _refuse_options(f"scenario {scenario}", {"--recordings": recordings is not None})
+        with _show_rendering() as advance:
+            spec = simulate_match(SCENARIOS[scenario], seed, out, options, advance=advance)
+    about = {"match": spec.match_id, "folder": str(out)}
+    answer(about, f"made match {spec.match_id} in {out}")
 
 
 def _refuse_options(what: str, options: dict[str, bool]) -> None:
@@ -114,12 +114,6 @@ def _refuse_options(what: str, options: dict[str, bool]) -> None:
                 found=f"{option}, which it does not have",
                 todo="Omit the option; docs/explanation/simulation.md describes the alternatives.",
             )
-
-
-def _report_match(match_id: str, out: Path) -> None:
-    """Print the id of the created match."""
-    about = {"match": match_id, "folder": str(out)}
-    answer(about, f"made match {match_id} in {out}")
 
 
 @contextmanager

@@ -55,17 +55,23 @@ def broadcast_pictures(run: Run, match: Match, clip: str | None = None) -> list[
     for view, camera in broadcast_cameras(run, clip).items():
         result, clock = run[f"broadcast_calibration/{view}"], image_clock(match.folder.spec, view)
         frame, expected = result["frame"].values, result["reprojection_error"].values
+        given: dict[str, Floats] | None = None
+        if (data := match.folder.camera_data.get(view)) is not None:
+            stated = read_given_camera(match.folder, view, data)
+            values = GivenCamera.of(stated, clock.number).values
+            names = ("pan [deg]", "tilt [deg]", "roll [deg]", "focal length [px]", "k1", "k2")
+            given = dict(zip(names, values[:, [0, 1, 2, 6, 7, 8]].T, strict=True))
         pictures.append(
             CaptionedImage(
                 f"{clip_title(view)}: the broadcast camera over its frames, smoothed (blue, with "
                 "bands of two standard deviations) and each frame on its own (orange)"
-                f"{', and camera data (dashed)' if view in match.folder.camera_data else ''}.",
+                f"{', and camera data (dashed)' if given else ''}.",
                 plot_camera_course(
                     frame,
                     camera,
                     run[broadcast_unit(run, view)]["covariance"].values,
                     camera_before(result.data_vars),
-                    _given_curves(match, view, clock.number),
+                    given,
                 ),
             )
         )
@@ -95,16 +101,6 @@ def broadcast_pictures(run: Run, match: Match, clip: str | None = None) -> list[
                 )
             )
     return pictures
-
-
-def _given_curves(match: Match, view: str, images: Integers) -> dict[str, Floats] | None:
-    """Return the curves of a view's camera data at images (frames,); None without data."""
-    if view not in match.folder.camera_data:
-        return None
-    data = read_given_camera(match.folder, view, match.folder.camera_data[view])
-    names = ("pan [deg]", "tilt [deg]", "roll [deg]", "focal length [px]", "k1", "k2")
-    values = GivenCamera.of(data, images).values[:, [0, 1, 2, 6, 7, 8]]
-    return dict(zip(names, values.T, strict=True))
 
 
 def _before_and_after(
@@ -213,6 +209,7 @@ def broadcast_tables(run: Run, match: Match, clip: str | None = None) -> list[Ta
     for view, camera in broadcast_cameras(run, clip).items():
         result = run[f"broadcast_calibration/{view}"]
         status = np.bincount(result["status"].values, minlength=len(FRAME_STATUS))
+        pan, _, _ = camera_angles(camera)
         rows = [
             *(
                 (f"frames that rest on: {name.replace('_', ' ')}", str(count))
@@ -224,7 +221,8 @@ def broadcast_tables(run: Run, match: Match, clip: str | None = None) -> list[Ta
                 (f"key frame {frame} is not used", why)
                 for frame, why in result.attrs["refused_key_frames"].items()
             ),
-            *_motion(camera, match.folder.spec.fps),
+            ("length [s]", f"{len(pan) / match.folder.spec.fps:.1f}"),
+            ("pan, from leftmost to rightmost [deg]", f"{np.nanmax(pan) - np.nanmin(pan):.1f}"),
             *(
                 (f"{name} miss by, before and after players [px]", _numbers(result.attrs[key]))
                 for name, key in (("markings", "markings_off"), ("people", "players_off"))
@@ -240,21 +238,11 @@ def broadcast_tables(run: Run, match: Match, clip: str | None = None) -> list[Ta
     return tables
 
 
-def _motion(camera: Camera, fps: float) -> list[tuple[str, str]]:
-    """Return the clip's duration and pan range as table rows."""
-    pan, _, _ = camera_angles(camera)
-    return [
-        ("length [s]", f"{len(pan) / fps:.1f}"),
-        ("pan, from leftmost to rightmost [deg]", f"{np.nanmax(pan) - np.nanmin(pan):.1f}"),
-    ]
-
-
 def _pooling_rows(run: Run, view: str) -> list[tuple[str, str]]:
     """Return the agreement of the camera position with its other clips, if there are any."""
-    unit = broadcast_unit(run, view)
-    if "distance" not in run[unit].attrs:
+    pooled = run[broadcast_unit(run, view)].attrs
+    if "distance" not in pooled:
         return []
-    pooled = run[unit].attrs
     apart = ", ".join(
         f"{name} {distance:.1f}"
         for name, distance in zip(pooled["clips"], pooled["distance"], strict=True)

@@ -8,7 +8,6 @@ from typing import Any, cast
 
 import numpy as np
 
-from data_contracts.arrays import Floats
 from data_contracts.match import MatchSpec
 from data_contracts.triangulation import HEALTH_MEASURES, CameraChange
 from flows.layers import pitch_of_run
@@ -57,28 +56,28 @@ def camera_table(run: Run, spec: MatchSpec) -> Table:
     rows = []
     for camera in spec.static_cameras:
         unit = f"static_calibration/{camera.id}"
-        figures = run.record.figures.get(unit, {})
+        figures, origin, wrong = run.record.figures.get(unit, {}), _ORIGINS["none"], list[str]()
+        if unit in run:
+            result = run[unit]
+            origin = _ORIGINS[result.attrs["origin"]]
+            if str((result.attrs["decisions"] or [""])[0]).startswith(PROPOSED):
+                origin = origin.replace("clicks", "proposed markings")
+            if "point_inlier" in result:
+                is_wrong = ~result["point_inlier"].values
+                wrong = [str(name) for name in result["point"].values[is_wrong]]
         rows.append(
             (
                 camera.id,
-                _origin(run[unit].attrs) if unit in run else _ORIGINS["none"],
+                origin,
                 format_scaled(figures.get("expected_ground_error_median_m"), 1000.0, 1),
                 format_scaled(figures.get("expected_ground_error_p95_m"), 1000.0, 1),
                 format_scaled(figures.get("reprojection_rms_px"), 1.0, 2),
                 format_scaled(figures.get("clicks_used"), 1.0, 0),
-                ", ".join(_wrong_clicks(run, unit)),
+                ", ".join(wrong),
                 Failure("; ".join(_reasons(run, camera.id))),
             )
         )
     return Table("", columns, tuple(rows))
-
-
-def _origin(attributes: Mapping[Any, Any]) -> str:
-    """Return what a camera was calibrated from, given the attributes of its result."""
-    said = _ORIGINS[attributes["origin"]]
-    decisions = attributes["decisions"] or [""]
-    is_proposed = str(decisions[0]).startswith(PROPOSED)
-    return said.replace("clicks", "proposed markings") if is_proposed else said
 
 
 def _reasons(run: Run, camera_id: str) -> tuple[str, ...]:
@@ -94,11 +93,9 @@ def _reasons(run: Run, camera_id: str) -> tuple[str, ...]:
 
 def health_picture(run: Run, match: Match, clip: str) -> list[CaptionedImage]:
     """Draw the health of a clip's static cameras over time; none without triangulated people."""
-    units = [f"{stage}/{clip}" for stage in ("retriangulation", "triangulation")]
-    if not any(unit in run for unit in units):
-        return []
-    found = run[next(unit for unit in units if unit in run)]
-    if "health" not in found:
+    units = (f"{stage}/{clip}" for stage in ("retriangulation", "triangulation"))
+    found = next((run[unit] for unit in units if unit in run), None)
+    if found is None or "health" not in found:
         return []
     changes = [CameraChange.model_validate(each) for each in found.attrs["changes"]]
     used = found["camera"].values.tolist()
@@ -201,14 +198,15 @@ def camera_evidence(store: Store, run: Run, match: Match, name: str, camera: Cam
     result = run[f"static_calibration/{name}"]
     names = (str(point) for point in result["point"].values)
     inlier = dict(zip(names, result["point_inlier"].values.tolist(), strict=True))
+    # The clicks that the run used: those of the folder may have changed since.
+    recipe = run.manifest(f"static_calibration/{name}").recipe
+    files = cast("dict[str, Any]", recipe.sources["clicked"]).values()
+    clicked = {point: np.array(at) for file in files for point, at in file["points"].items()}
     return plot_calibration(
         camera,
         f"camera {name}",
         pitch,
-        clicks=[
-            Click(_spoken(point), place, inlier[point])
-            for point, place in _clicked_places(run, name).items()
-        ],
+        clicks=[Click(_spoken(point), at, inlier[point]) for point, at in clicked.items()],
         still=background_image(store, match, name),
         error_map=ErrorMap(
             result["ground_x"].values, result["ground_y"].values, result["ground_error"].values
@@ -245,20 +243,3 @@ def proposal_evidence(
     )
     columns = ("marking", ">length in the image [px]", ">on paint")
     return CaptionedImage(caption, png), Table("Markings that the proposal expects", columns, rows)
-
-
-def _wrong_clicks(run: Run, unit: str) -> tuple[str, ...]:
-    if unit not in run or "point_inlier" not in (result := run[unit]):
-        return ()
-    wrong = ~result["point_inlier"].values
-    return tuple(str(name) for name in result["point"].values[wrong])
-
-
-def _clicked_places(run: Run, camera_id: str) -> dict[str, Floats]:
-    """Return the clicks that the run used: those of the folder may have changed since.
-
-    A camera without clicks was proposed from its image.
-    """
-    recipe = run.manifest(f"static_calibration/{camera_id}").recipe
-    files = cast("dict[str, Any]", recipe.sources["clicked"]).values()
-    return {name: np.array(place) for file in files for name, place in file["points"].items()}

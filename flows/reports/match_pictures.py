@@ -48,9 +48,6 @@ def frame_picture(store: Store, match: Match, owner: str, frame: int) -> Image |
     """Return a camera's image (height, width, 3) RGB in a match frame; None if there is none.
 
     The owner is a static camera or a broadcast view; here and below.
-
-    Raises:
-        InputError: the image is damaged.
     """
     return next(frame_pictures(store, match, owner, [frame]))
 
@@ -68,22 +65,16 @@ def frame_pictures(
         yield from (None for _ in frames)
         return
     spec, wanted = match.folder.spec, np.asarray(frames, dtype=np.int64)
-    numbers = _known_numbers(store, match, owner, wanted)
+    numbers: Integers | None = None
+    results = store.run(match.match_id).results if store.runs(match.match_id) else {}
+    if (key := results.get(f"ingest/{owner}")) is not None:
+        footage = store.open_result(match.match_id, "ingest", owner, key)
+        if "picture_of_frame" in footage:  # as ingest found them; -1 = none
+            known = footage["picture_of_frame"].reindex(frame=wanted, fill_value=-1)
+            numbers = known.values.astype(np.int64)
     with open_video(file) as video:
         if numbers is None:
             clock = unit_frames(spec, owner)
             numbers = video.index.shown(clock.numbers(wanted), spec.fps * clock.rate, str(file))
         numbers[numbers >= len(video)] = -1
         yield from pictures_at(video, numbers)
-
-
-def _known_numbers(store: Store, match: Match, owner: str, frames: Integers) -> Integers | None:
-    """Return the video frames of match frames, -1 if there is none, as ingest found them."""
-    results = store.run(match.match_id).results if store.runs(match.match_id) else {}
-    key = results.get(f"ingest/{owner}")
-    if key is not None:
-        footage = store.open_result(match.match_id, "ingest", owner, key)
-        if "picture_of_frame" in footage:
-            known = footage["picture_of_frame"].reindex(frame=frames, fill_value=-1)
-            return known.values.astype(np.int64)
-    return None

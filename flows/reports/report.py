@@ -75,9 +75,6 @@ def write_report(
 
     Returns:
         The videos written next to it; and why a reference is not scored, empty if it is.
-
-    Raises:
-        UsageError: there is no such static camera with a video.
     """
     if out.is_dir():
         todo = f"Name a file in it, as in --out {out / 'report.html'}."
@@ -89,7 +86,11 @@ def write_report(
     if not any(unit.startswith(("static_calibration/", BROADCAST)) for unit in run):
         clips_of(run.record)  # without cameras, there have to be people
     scores, truth, unscored = _against_truth(store, run, match, reference)
-    _load_late_modules(run)
+    # What two threads would import late. Modules of large libraries import each other in a circle,
+    # and a thread that enters it elsewhere than the other gets a module without its names.
+    import_module("worldpose.store.groups")
+    if broadcast_views(run):
+        import_module("flows.reports.broadcast")
     with ThreadPoolExecutor(1) as painter:
         # Painting and encoding leave the interpreter to the figures for much of their time.
         filming = painter.submit(_write_videos, store, run, match, out, camera) if videos else None
@@ -102,11 +103,8 @@ def write_report(
             raise
     films = [] if filming is None else filming.result()
     beside = [LinkedFile(film.stem.removeprefix(f"{out.stem}-"), film.name) for film in films]
-    shown = Section(
-        "Videos",
-        tuple(beside),
-        "With markings and people drawn over them, in the folder of this page.",
-    )
+    about = "With markings and people drawn over them, in the folder of this page."
+    shown = Section("Videos", tuple(beside), about)
     if unscored:
         others.append(Section("Against the truth", (Table("", ("",), ((Failure(unscored),),)),)))
     if figures is not None and kept is not None:
@@ -122,17 +120,6 @@ def write_report(
     with whole_file(out) as draft:
         draft.write_text(page, encoding="utf-8")
     return films, unscored
-
-
-def _load_late_modules(run: Run) -> None:
-    """Import what both the videos and the sections import late, before two threads make them.
-
-    Modules of large libraries import each other in a circle. If two threads enter the circle at
-    different places, one of them gets a module without its names.
-    """
-    import_module("worldpose.store.groups")
-    if broadcast_views(run):
-        import_module("flows.reports.broadcast")
 
 
 def _write_figures(sections: list[Section], kept: Mapping[bytes, Figure], folder: Path) -> None:
@@ -185,6 +172,11 @@ def _sections(store: Store, run: Run, match: Match, truth: JointTracks | None) -
     filmed = clips if match.has_static_cameras else ()
     cameras = static_cameras(run, match.folder.spec)
     viewer, left_out = report_viewer(run, match)
+    broadcast = list[CaptionedImage | Table]()
+    if broadcast_views(run):  # late: it imports the estimators of a broadcast camera
+        from flows.reports.broadcast import broadcast_pictures, broadcast_tables
+
+        broadcast = [*broadcast_pictures(run, match), *broadcast_tables(run, match)]
     return [
         Section(
             "3D view",
@@ -219,7 +211,7 @@ def _sections(store: Store, run: Run, match: Match, truth: JointTracks | None) -
             ),
         ),
         Section("Bundle adjustment", tuple(adjustment_tables(run))),
-        Section("Broadcast camera", tuple(_broadcast_blocks(run, match))),
+        Section("Broadcast camera", tuple(broadcast)),
         Section(
             "Bodies",
             (
@@ -229,15 +221,6 @@ def _sections(store: Store, run: Run, match: Match, truth: JointTracks | None) -
         ),
         Section("Who reviewed what", tuple(review_table(match))),
     ]
-
-
-def _broadcast_blocks(run: Run, match: Match) -> list[CaptionedImage | Table]:
-    if not broadcast_views(run):
-        return []
-    # Late: it imports the estimators of a broadcast camera.
-    from flows.reports.broadcast import broadcast_pictures, broadcast_tables
-
-    return [*broadcast_pictures(run, match), *broadcast_tables(run, match)]
 
 
 def _against_truth(
@@ -280,23 +263,18 @@ def extent_of(run: Run, match: Match) -> DataSetStatistics:
     return data_set_statistics(clips)
 
 
-def _placed_extent(run: Run, match: Match) -> DataSetStatistics:
-    """Count as `extent_of` does, with the people whom only their feet place."""
-    clips = {}
-    for clip in find_clips(run.record):
-        xy = clip_positions(run, clip).xy
-        places = np.concatenate([xy, np.zeros((*xy.shape[:2], 1))], axis=-1)
-        clips[clip] = clip_statistics(places, match.folder.spec.fps)
-    return data_set_statistics(clips)
-
-
 def tiles_of(run: Run, match: Match, scores: Evaluation | None) -> list[tuple[str, str]]:
     """Return the key metrics for the top of the report."""
     static = (f"{len(match.folder.spec.static_cameras)}", "static cameras")
     if not find_clips(run.record):
         moving = broadcast_cameras(run).values()
         return [static, (f"{sum(len(each.focal) for each in moving):,}", "broadcast frames")]
-    found, placed = extent_of(run, match), _placed_extent(run, match)
+    clips_with_feet = {}
+    for clip in find_clips(run.record):  # also of people whom only their feet place
+        xy = clip_positions(run, clip).xy
+        places = np.concatenate([xy, np.zeros((*xy.shape[:2], 1))], axis=-1)
+        clips_with_feet[clip] = clip_statistics(places, match.folder.spec.fps)
+    found, placed = extent_of(run, match), data_set_statistics(clips_with_feet)
     in_3d, people = (sum(clip.persons for clip in each.clips.values()) for each in (found, placed))
     clips = "1 clip" if len(found.clips) == 1 else f"{len(found.clips)} clips"
     tiles = [

@@ -76,7 +76,7 @@ def write_viewers(origin: Origin, out: Path) -> list[Path]:
         UsageError: a video is asked for, and no camera of a clip has one.
         InputError: there is nobody to show.
     """
-    page, footage = _viewer_page(), origin.footage
+    page, (store, match) = _viewer_page(), origin.footage or (None, None)
     written: dict[Path, tuple[str, ...]] = {
         out / "viewer" / f"{clip}.html": (clip,) for clip in origin.clips
     }
@@ -84,33 +84,24 @@ def write_viewers(origin: Origin, out: Path) -> list[Path]:
         written = {out: origin.clips}
     for path, names in written.items():
         with TemporaryDirectory(prefix="worldpose-viewer-") as draft:
-            videos = {name: _draw_video(origin, name, Path(draft)) for name in names if footage}
-            clips = [
-                viewer_clip(
-                    origin,
-                    name,
-                    describe_video(origin.run, footage.match, name) if footage else None,
-                )
-                for name in names
-            ]
+            videos, clips = dict[str, Path](), []
+            for name in names:
+                video = None
+                if store is not None and match is not None:
+                    video = describe_video(origin.run, match, name)
+                    if video is None:
+                        raise UsageError(
+                            "--video",
+                            expected=f"a camera with a video that films clip {name}",
+                            found="no video of any camera",
+                            todo="Export without --video, or add the videos to the match's folder "
+                            "videos/.",
+                        )
+                    videos[name] = Path(draft) / f"{name}.mp4"
+                    write_clip_video(store, origin.run, match, name, videos[name])
+                clips.append(viewer_clip(origin, name, video))
             write_viewer(path, page, clips, videos)
     return list(written)
-
-
-def _draw_video(origin: Origin, clip: str, folder: Path) -> Path:
-    """Draw the overlay video of a clip; return the file."""
-    footage = origin.footage
-    assert footage is not None  # the caller asks
-    if clip_view(origin.run, footage.match, clip) is None:
-        raise UsageError(
-            "--video",
-            expected=f"a camera with a video that films clip {clip}",
-            found="no video of any camera",
-            todo="Export without --video, or add the videos to the match's folder videos/.",
-        )
-    file = folder / f"{clip}.mp4"
-    write_clip_video(footage.store, origin.run, footage.match, clip, file)
-    return file
 
 
 def describe_video(run: Run, match: Match, clip: str) -> dict[str, Any] | None:
@@ -158,6 +149,10 @@ def viewer_clip(origin: Origin, clip: str, video: Mapping[str, Any] | None) -> V
         spread[:, column] = np.sqrt(np.where(variance > 0.0, variance, np.nan))
     if tracks.views is not None:
         views[:, column] = tracks.views
+    # x, y and standard deviation (frames, people, 3) [m] of people placed by their feet.
+    variance = np.trace(positions.covariance, axis1=-2, axis2=-1) / 2.0
+    error = np.sqrt(np.where(variance > 0.0, variance, np.nan))
+    ground = np.concatenate([positions.xy, error[..., None]], axis=-1)
     model, bodies = _bodies(origin, clip, tracks, positions)
     still = static_cameras(origin.run, origin.spec, origin.stage)
     notes = {"units": "metres, seconds"} | note_undrawn_distortion(still)
@@ -169,7 +164,7 @@ def viewer_clip(origin: Origin, clip: str, video: Mapping[str, Any] | None) -> V
         joints=joints,
         spread=spread,
         views=views,
-        ground=_ground(positions),
+        ground=np.where(positions.on_plane[..., None], ground, np.nan),
         height=positions.height,
         bodies=bodies,
         model=model,
@@ -188,8 +183,7 @@ def _bodies(
     unit = bodies_unit(origin.run, clip)
     if unit not in origin.run or origin.stage not in (None, *BODY_STAGES):
         return None, None
-    model, poses, persons = fitted_bodies(origin.run, clip)
-    own = origin.run[unit]["frame"].values
+    model, poses, persons, own = fitted_bodies(origin.run, clip)
     _, rows, here = np.intersect1d(own, tracks.frames, return_indices=True)
     column = np.searchsorted(positions.person, persons)
 
@@ -198,17 +192,5 @@ def _bodies(
         placed[here[:, None], column] = values[:, rows].swapaxes(0, 1)
         return placed
 
-    return model, BodyParameters(
-        betas=place(poses.betas),
-        global_orient=place(poses.global_orient),
-        body_pose=place(poses.body_pose),
-        transl=place(poses.transl),
-    )
-
-
-def _ground(positions: Positions) -> Floats:
-    """Return x, y and standard deviation (frames, people, 3) [m] of people placed by their feet."""
-    variance = np.trace(positions.covariance, axis1=-2, axis2=-1) / 2.0
-    spread = np.sqrt(np.where(variance > 0.0, variance, np.nan))
-    ground = np.concatenate([positions.xy, spread[..., None]], axis=-1)
-    return np.where(positions.on_plane[..., None], ground, np.nan)
+    names = ("betas", "global_orient", "body_pose", "transl")
+    return model, BodyParameters(*(place(getattr(poses, name)) for name in names))

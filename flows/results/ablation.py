@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -115,24 +117,17 @@ def trial(seed: int, clicks: ClickSettings) -> dict[str, Score]:
         "+ BA, S only": (markings.cameras, markings.accepted),
         "+ BA, S, unguarded": (markings.refused, everyone),
     }
-    names = tuple(calibrations)
+    score = partial(_score, scene, clip, tuple(calibrations))
     scores = {
-        name + how: _score(
-            scene,
-            clip,
-            names,
-            cameras,
-            changed,
-            triangulate_joints(cameras, clip.detections, settings).joints,
+        name + how: score(
+            cameras, changed, triangulate_joints(cameras, clip.detections, settings).joints
         )
         for how, settings in TRIANGULATIONS.items()
         for name, (cameras, changed) in rows.items()
     }
     placed = triangulate_joints(both.cameras, clip.detections, _OURS, both.covariance)
-    scores["+ BA + SMPL"] = _score(
-        scene, clip, names, both.cameras, both.accepted, _fit(scene, clip, placed)
-    )
-    return scores | _by_paper(scene, clip, calibrations, pitch)
+    scores["+ BA + SMPL"] = score(both.cameras, both.accepted, _fit(scene, clip, placed))
+    return scores | _by_paper(score, clip, calibrations, pitch)
 
 
 def ablation(
@@ -149,16 +144,12 @@ def ablation(
 
 def _calibrate_cameras(scene: Scene, pitch: PitchTemplate) -> dict[str, StaticCalibration]:
     """Calibrate the cameras whose clicks determine them; skip the others."""
-    found = {}
+    found, settings = {}, StaticCalibrationSettings(lines=False)
     for name, camera in scene.cameras.items():
         size = (int(camera.image_size[0]), int(camera.image_size[1]))
-        settings = StaticCalibrationSettings(lines=False)
-        try:
-            found[name] = calibrate_camera(
-                pitch, scene.clicks[name].markings, size, settings=settings, where=name
-            )
-        except InputError:
-            continue
+        clicks = scene.clicks[name].markings
+        with suppress(InputError):
+            found[name] = calibrate_camera(pitch, clicks, size, settings=settings, where=name)
     return found
 
 
@@ -185,7 +176,10 @@ def _clip(
 
 
 def _by_paper(
-    scene: Scene, clip: Clip, known: Mapping[str, StaticCalibration], pitch: PitchTemplate
+    score: Callable[[Camera, np.ndarray, Floats], Score],
+    clip: Clip,
+    known: Mapping[str, StaticCalibration],
+    pitch: PitchTemplate,
 ) -> dict[str, Score]:
     """Return the paper's four rows by its own method, from the same tracks.
 
@@ -216,11 +210,9 @@ def _by_paper(
     for name, (cameras, changed) in rows.items():
         start = triangulate_joints(cameras, clip.detections, _OURS).joints
         joints[name] = place_joints(cameras, clip.detections, start, about_mid_hip=False)
-        scores[name + BY_PAPER] = _score(scene, clip, tuple(known), cameras, changed, joints[name])
+        scores[name + BY_PAPER] = score(cameras, changed, joints[name])
     bodies = _fit_as_paper(clip, both.cameras, joints["+ BA, S and P"])
-    scores["+ BA + SMPL" + BY_PAPER] = _score(
-        scene, clip, tuple(known), both.cameras, both.accepted, bodies
-    )
+    scores["+ BA + SMPL" + BY_PAPER] = score(both.cameras, both.accepted, bodies)
     return scores
 
 

@@ -17,9 +17,6 @@ def export_after_run(store: Store, match: Match, record: RunRecord) -> list[Path
 
     Only a run that has results of its last stage is exported; if it has no people, only in formats
     of cameras. Files of an earlier run of the match are replaced.
-
-    Raises:
-        InputError: no folder is known, or a format needs what the run has not.
     """
     settings = merge_general(match.layers)
     if not settings.exports or record.state not in ("complete", "partial"):

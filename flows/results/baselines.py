@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
@@ -224,7 +225,10 @@ def table_latex(scores: Sequence[MethodScore]) -> str:
     for group in _groups(scores):
         lines.append("  \\midrule")
         for row in group:
-            cells = (*map(_escape, row[:texts]), *map(_space_thousands, row[texts:]))
+            cells = [re.sub(r"([&%_#$])", r"\\\1", text) for text in row[:texts]]
+            for cell in row[texts:]:  # with thin spaces between thousands
+                number = cell if cell == _ABSENT else f"{float(cell):,.1f}"
+                cells.append(number.replace(",", "\\,"))
             lines.append(f"  {' & '.join(cells)} \\\\")
     return "\n".join([*lines, "  \\bottomrule", "\\end{tabular}"]) + "\n"
 
@@ -256,12 +260,3 @@ def _row(title: str, score: MethodScore, instead: dict[str, str]) -> tuple[str, 
         factor = 100.0 if name == "track_coverage" else 1.0
         cells.append(_ABSENT if value is None else f"{factor * value:.1f}")
     return (title, *cells)
-
-
-def _space_thousands(cell: str) -> str:
-    """Return a number with thin spaces between thousands."""
-    return cell if cell == _ABSENT else f"{float(cell):,.1f}".replace(",", "\\,")
-
-
-def _escape(text: str) -> str:
-    return "".join(f"\\{sign}" if sign in "&%_#$" else sign for sign in text)

@@ -67,11 +67,7 @@ def all_clips(run: Run) -> tuple[str, ...]:
 
 
 def clips_of(record: RunRecord) -> tuple[str, ...]:
-    """Return the clips for which a run has joints, or people on the pitch.
-
-    Raises:
-        InputError: there are no such clips.
-    """
+    """Return the clips for which a run has joints, or people on the pitch."""
     clips = find_clips(record)
     if not clips:
         stages = dict.fromkeys(name.partition("/")[0] for name in record.results)
@@ -160,9 +156,6 @@ def joint_tracks(
     model has them, and triangulated ones without a body; `source` tells which. If the first
     triangulation is the best available, the frames that it skipped have the tracker's joints,
     without covariance.
-
-    Raises:
-        UsageError: the run has no such result.
     """
     stages = [name for name in reversed(JOINT_STAGES) if f"{name}/{clip}" in run]
     on_plane = f"{PLANE}/{clip}" in run
@@ -362,14 +355,6 @@ def body_tracks(run: Run, clip: str) -> BodyTracks | None:
 
 
 @dataclass(frozen=True)
-class Footage:
-    """Videos of a match, whose latest run in the store maps match frames to video frames."""
-
-    store: Store
-    match: Match
-
-
-@dataclass(frozen=True)
 class Origin:
     """Run whose results an export writes, with the options of the export."""
 
@@ -385,8 +370,8 @@ class Origin:
     """Write also the surface of a body model that has terms of its own."""
     definition: JointDefinition = "detector"
     """Definition of the joints of bodies."""
-    footage: Footage | None = None
-    """Videos to embed in viewer files; None = none."""
+    footage: tuple[Store, Match] | None = None
+    """Videos to embed in viewer files, and the store whose latest run maps frames; None = none."""
 
     @property
     def spec(self) -> MatchSpec:
@@ -415,8 +400,10 @@ class Origin:
         return fill_gaps(tracks) if self.filled else tracks
 
 
-def fitted_bodies(run: Run, clip: str) -> tuple[BodyModel, BodyParameters, NDArray[np.int32]]:
-    """Return body model, poses (persons, frames) and person ids of a clip's fits.
+def fitted_bodies(
+    run: Run, clip: str
+) -> tuple[BodyModel, BodyParameters, NDArray[np.int32], Integers]:
+    """Return body model, poses (persons, frames), person ids, and match frames of a clip's fits.
 
     Raises:
         InputError: the run has no fitted bodies.
@@ -427,15 +414,11 @@ def fitted_bodies(run: Run, clip: str) -> tuple[BodyModel, BodyParameters, NDArr
         fits["betas"].values[:, None],
         *(fits[name].values.swapaxes(0, 1) for name in ("global_orient", "body_pose", "transl")),
     )
-    return fitted_model(run, unit), poses, fits["person"].values
+    return fitted_model(run, unit), poses, fits["person"].values, fits["frame"].values
 
 
 def require_result(run: Run, unit: str, todo: str) -> str:
-    """Return the name of a result that the run has.
-
-    Raises:
-        InputError: the run has no such result.
-    """
+    """Return the name of a result that the run has."""
     if unit not in run:
         raise InputError(
             f"run {run.record.run_id} of {run.record.match_id}",
@@ -480,11 +463,7 @@ def _with_tracked_joints(
 
 
 def placed_joints(run: Run, clip: str, stage: str | None = None) -> xr.Dataset:
-    """Return the joints of one clip that `stage` or the best one triangulated, with their views.
-
-    Raises:
-        UsageError: the run has none.
-    """
+    """Return the joints of one clip that `stage` or the best one triangulated, with their views."""
     for each in TRIANGULATED[stage == "triangulation" :]:
         if f"{each}/{clip}" in run:
             return _stage_joints(run, clip, each)

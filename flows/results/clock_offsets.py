@@ -90,11 +90,8 @@ class ClockOffsets(NamedTuple):
 def find_offsets(run: Run, match: Match, clip: str | None, max_offset_s: float) -> ClockOffsets:
     """Find the clock offsets of static cameras in a clip, or else in the longest.
 
-    Args:
-        run: its cameras are calibrated, and it has 2D poses.
-        match: the match of the run.
-        clip: a clip of the match.
-        max_offset_s: largest offset between two cameras [s].
+    The cameras of the run are calibrated, and it has 2D poses; `max_offset_s` is the largest offset
+    between two cameras [s].
 
     Raises:
         InputError: fewer than two cameras have a calibration and 2D poses.
@@ -102,7 +99,21 @@ def find_offsets(run: Run, match: Match, clip: str | None, max_offset_s: float) 
     """
     spec, pitch = match.folder.spec, match.folder.pitch
     clip = choose_clip(spec, clip)
-    cameras, names, detections = load_clip(run, match, clip)
+    known = static_cameras(run, spec)
+    names = [
+        camera.id
+        for camera, unit in zip(spec.static_cameras, seen_by_cameras(match, clip), strict=True)
+        if camera.id in known and unit in run
+    ]
+    if len(names) < 2:
+        raise InputError(
+            f"{match.match_id}: static cameras",
+            expected="two calibrated cameras with 2D poses",
+            found=", ".join(names) or "none",
+            todo="Calibrate the cameras first; worldpose status tells what is missing.",
+        )
+    cameras = Camera.stack([known[name] for name in names])
+    detections = load_detections(run, match, clip, names)
     template = None if pitch is None else PitchTemplate.from_spec(pitch)
     found, courses = find_clocks(cameras, detections, spec.fps, max_offset_s, template)
     its = spec.clip(clip)
@@ -194,47 +205,15 @@ def _rounding(unit: UnitFrames, clip: ClipSpec) -> float:
 
 
 def choose_clip(spec: MatchSpec, clip: str | None) -> str:
-    """Return the requested clip, or else the longest.
-
-    Raises:
-        UsageError: the match has no such clip.
-    """
+    """Return the requested clip, or else the longest."""
     names = [each.id for each in spec.clips]
     if clip is not None and clip not in names:
         raise unknown_name(f"--clip {clip}", clip, names)
     return clip or max(spec.clips, key=lambda each: each.frame_count).id
 
 
-def load_clip(run: Run, match: Match, clip: str) -> tuple[Camera, list[str], KeypointDetections]:
-    """Return the calibrated cameras, their names, and their detections in a clip.
-
-    Raises:
-        InputError: fewer than two cameras have a calibration and 2D poses.
-    """
-    spec = match.folder.spec
-    known = static_cameras(run, spec)
-    seen = [
-        camera.id
-        for camera, unit in zip(spec.static_cameras, seen_by_cameras(match, clip), strict=True)
-        if camera.id in known and unit in run
-    ]
-    if len(seen) < 2:
-        raise InputError(
-            f"{match.match_id}: static cameras",
-            expected="two calibrated cameras with 2D poses",
-            found=", ".join(seen) or "none",
-            todo="Calibrate the cameras first; worldpose status tells what is missing.",
-        )
-    cameras = Camera.stack([known[name] for name in seen])
-    return cameras, seen, load_detections(run, match, clip, seen)
-
-
 def load_detections(run: Run, match: Match, clip: str, names: list[str]) -> KeypointDetections:
-    """Return the detections (frames, cameras, detections) of some static cameras in a clip.
-
-    Raises:
-        InputError: a camera has no 2D poses.
-    """
+    """Return the detections (frames, cameras, detections) of some static cameras in a clip."""
     span = match.folder.spec.clip(clip)
     where = slice(span.first_frame, span.first_frame + span.frame_count - 1)
     frames = np.arange(span.first_frame, span.first_frame + span.frame_count)

@@ -122,26 +122,24 @@ def _mark(figure: str, before: float, after: float) -> Mark:
 
 
 def _subjects(record: RunRecord, names: Mapping[tuple[str, str], str]) -> dict[Subject, Figures]:
-    """Return the metrics of every subject of a run; `names` are players' names in the other run."""
+    """Return the metrics of every subject of a run, of bodies those of the last fit.
+
+    `names` are players' names in the other run.
+    """
     found: dict[Subject, Figures] = {}
-    for unit, figures in _last_of_all(record):
+    last = BODY_STAGES[-1]
+    for unit, figures in record.figures.items():
         stage, _, place = unit.partition("/")
+        if stage in BODY_STAGES:
+            if stage != last and f"{last}/{place}" in record.figures:
+                continue
+            stage, unit = "bodies", f"bodies/{place}"
         for name, value in figures.items():
             figure, _, part = name.partition(".")
             if figure in MIN_CHANGES.get(stage, {}):
                 subject = _subject(stage, place, part, names)
                 found.setdefault(subject, {})[f"{unit} {figure}"] = value
     return found
-
-
-def _last_of_all(record: RunRecord) -> Iterator[tuple[str, Mapping[str, float]]]:
-    """Yield units with metrics; bodies only from the last fit."""
-    for unit, figures in record.figures.items():
-        stage, _, clip = unit.partition("/")
-        if stage not in BODY_STAGES:
-            yield unit, figures
-        elif stage == BODY_STAGES[-1] or f"{BODY_STAGES[-1]}/{clip}" not in record.figures:
-            yield f"bodies/{clip}", figures
 
 
 def _subject(stage: str, unit: str, part: str, names: Mapping[tuple[str, str], str]) -> Subject:
@@ -193,7 +191,6 @@ class BodiesOfBoth:
     """Bodies of one clip in two runs, in their common frames.
 
     Attributes:
-        clip: its id.
         frame: (frames,) match frames.
         person_before: (persons,) ids in A.
         person_after: (others,) ids in B.
@@ -272,10 +269,8 @@ class PoseChange:
     moved_px: float
 
 
-def largest_pose_changes(
-    store: Store, a: RunRecord, b: RunRecord, most: int = 5
-) -> list[PoseChange]:
-    """Return the images with the largest pose changes, one per camera and clip, largest first.
+def largest_pose_changes(store: Store, a: RunRecord, b: RunRecord) -> list[PoseChange]:
+    """Return the five images with the largest pose changes, one per camera and clip, in order.
 
     Each run's bodies are projected with its own cameras.
     """
@@ -286,7 +281,7 @@ def largest_pose_changes(
     for bodies in bodies_of_both(ours, theirs):
         for name in sorted(before.keys() & after.keys()):
             found += _worst(bodies, name, before, after)
-    return sorted(found, key=lambda picture: -picture.moved_px)[:most]
+    return sorted(found, key=lambda picture: -picture.moved_px)[:5]
 
 
 def _worst(

@@ -61,10 +61,6 @@ def write_data_set(
     `train` and `val` have poses, joints, cameras and boxes; `test` has boxes, and cameras with the
     pose of the first frame alone: the rest is in the new folder `hidden`. Licences are texts by
     kind of file; `subjects` is a YAML file with lists of MATCH/NAME or MATCH/CLIP/ID.
-
-    Raises:
-        UsageError: a folder exists, or the test part has no hidden folder.
-        InputError: a result, video or licence is missing, or a subject is in two splits.
     """
     tested = any(split == "test" for _, split in origins)
     public, secret = out.resolve(), (hidden or out).resolve()
@@ -152,7 +148,7 @@ def _write_clip(
     """
     public = root / "public" / split
     part = root / "hidden" if split == "test" else public
-    model, poses, people = best_results.fitted_bodies(origin.run, clip)
+    model, poses, people, _ = best_results.fitted_bodies(origin.run, clip)
     tracks, spec = replace(origin, definition="body").tracks(clip), origin.spec
     joints_file.write_poses(part / "poses" / f"{name}.npz", poses, model.name)
     joints_file.write_joints(part / f"{name}.joints.npz", tracks)
@@ -231,11 +227,7 @@ def project_people(
 def _name_subjects(
     clips: Mapping[str, contracts.ReleasedSequence], file: Path | None
 ) -> dict[str, contracts.ReleasedSequence]:
-    """Return the clips with the subjects of a registry.
-
-    Raises:
-        InputError: the registry has another form or unknown people.
-    """
+    """Return the clips with the subjects of a registry."""
     registry = {} if file is None else read_yaml(file)
     known = {person for clip in clips.values() for person in clip.subjects}
     owner: dict[str, str] = {}

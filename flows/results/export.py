@@ -96,7 +96,7 @@ def export_worldpose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
             errors[name] = {"lens_model": LensModel(int(camera.lens_model)).label, **off}
     for clip in best_results.all_clips(origin.run):
         if clip in with_people:
-            model, poses, _ = best_results.fitted_bodies(origin.run, clip)
+            model, poses, *_ = best_results.fitted_bodies(origin.run, clip)
             path = out / "poses" / f"{clip}.npz"
             write_poses(path, poses, model.name)
             yield path
@@ -130,7 +130,7 @@ def export_challenge(
     submissions: dict[str, Floats] = {}
     filled: dict[str, dict[str, Any]] = {}
     for view, (clip, camera) in filmed.items():
-        model, poses, _ = best_results.fitted_bodies(origin.run, clip)
+        model, poses, *_ = best_results.fitted_bodies(origin.run, clip)
         truth = challenge.challenge_truth(model, poses, camera)
         submissions[view], told = _by_given_rows(origin, clip, truth)
         filled |= {view: told} if any(told.values()) else {}
@@ -193,7 +193,7 @@ def export_tracks(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     """Write `tracks/<view>.txt`, our boxes in the broadcast image, and the paper's settings."""
     yield _write_baseline_settings(out)
     for view, (clip, camera) in _filmed(origin).items():
-        model, poses, persons = best_results.fitted_bodies(origin.run, clip)
+        model, poses, persons, _ = best_results.fitted_bodies(origin.run, clip)
         truth = challenge.challenge_truth(model, poses, camera)
         path = out / "tracks" / f"{view}.txt"
         number = image_clock(origin.spec, view).number
@@ -245,11 +245,7 @@ def export_positions(origin: best_results.Origin, out: Path) -> Iterator[Path]:
 
 
 def export_minimap(origin: best_results.Origin, out: Path) -> Iterator[Path]:
-    """Write `minimap/<clip>.mp4`: the pitch from above with all people and their kind.
-
-    Raises:
-        UsageError: the match has no pitch.
-    """
+    """Write `minimap/<clip>.mp4`: the pitch from above with all people and their kind."""
     # Imported here: it loads matplotlib's colours, which takes 0.5 s.
     from worldpose.reports.videos import minimap_frames
 
@@ -312,11 +308,6 @@ def export(
     origins/<clip>.npz, which flags them. Earlier files of the same match are replaced. `out` is a
     folder, or a file of the viewer. `overwrite` also replaces files of another match or of unknown
     origin.
-
-    Raises:
-        UsageError: an unknown format, two with the same file names, or a file in place of a folder.
-        InputError: the folder cannot be written, holds a file of the same name of another match, or
-            a format's results are missing. Nothing is written then.
     """
     if out.suffix == VIEWER_SUFFIX and set(forms) != {"viewer"}:
         raise _file_for_folder(out, forms)

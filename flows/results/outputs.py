@@ -49,9 +49,6 @@ def require_own(
 
     `drafts` maps the name of each file to its new content, None if that does not exist yet. With
     `overwrite`, only files of a release are refused.
-
-    Raises:
-        InputError: a file with other content has another owner.
     """
     known = read_owners(folder)
     for name, draft in drafts.items():
@@ -82,33 +79,16 @@ def own_whole(
 ) -> None:
     """Record the first owner of files and of clips' entries in shared ones; or refuse.
 
-    Raises:
-        InputError: as `require_own`; or an entry would change that files of another match have.
+    An entry counts for all files of a clip of this name, so equal ones have several owners; its
+    name is `FILE: CLIP`.
     """
     files = {name: draft for name, draft in drafts.items() if name not in SHARED}
     require_own(folder, files, owners, overwrite=overwrite)
-    shared = {name: drafts[name] for name in SHARED & drafts.keys()}
-    entries = _own_entries(folder, shared, clips, owners, overwrite=overwrite)
-    if record:
-        record_owner(folder, files, owners[0], entries)
-
-
-def _own_entries(
-    folder: Path,
-    drafts: Mapping[str, Path],
-    clips: Collection[str],
-    owners: tuple[str, ...],
-    *,
-    overwrite: bool,
-) -> dict[str, str]:
-    """Return the owners of these clips' entries in shared files, as `FILE: CLIP`.
-
-    An entry counts for all files of a clip of this name, so equal ones have several owners.
-    """
     known, found = read_owners(folder), {}
-    for name, draft in drafts.items():
+    for name in SHARED & drafts.keys():
         path = folder / name
-        old, new = (json.loads(f.read_bytes()) if f.is_file() else {} for f in (path, draft))
+        both = (path, drafts[name])
+        old, new = (json.loads(file.read_bytes()) if file.is_file() else {} for file in both)
         for clip in sorted(new.keys() & set(clips)):
             before = known.get(f"{name}: {clip}", "unknown origin") if clip in old else owners[0]
             other, same = before not in owners, old.get(clip, new[clip]) == new[clip]
@@ -119,9 +99,10 @@ def _own_entries(
                     found=f"{old[clip]}, of {before}",
                     todo="Choose another folder, or rename the clip. Nothing was written.",
                 )
-            both = before if owners[0] in before.split(" and ") else f"{before} and {owners[0]}"
-            found[f"{name}: {clip}"] = both if same else owners[0]
-    return found
+            all_ = before if owners[0] in before.split(" and ") else f"{before} and {owners[0]}"
+            found[f"{name}: {clip}"] = all_ if same else owners[0]
+    if record:
+        record_owner(folder, files, owners[0], found)
 
 
 def record_owner(
@@ -148,11 +129,7 @@ def claim_file(file: Path | None, owner: str) -> None:
 
 
 def require_new(file: Path | None) -> None:
-    """Refuse to replace a file that people edit.
-
-    Raises:
-        InputError: the file exists.
-    """
+    """Refuse to replace a file that people edit."""
     if file is not None and file.exists():
         raise InputError(
             str(file),
@@ -171,9 +148,6 @@ def write_whole(
 
     An error while they are written leaves `out` as it was. `claim` refuses to replace files of a
     folder, given their drafts by name. This call adds to `SHARED` files, whose entries have owners.
-
-    Raises:
-        InputError: `out` cannot be written, or one of its files is a folder.
     """
     is_file = out.suffix == VIEWER_SUFFIX
     if out.exists() and out.is_dir() == is_file:
@@ -203,14 +177,8 @@ def write_whole(
             for target in targets.values():
                 if target.is_dir():
                     raise _unwritable(target, "a folder")
-            above_files = out.parent if is_file else out
-            claim(
-                above_files,
-                {
-                    target.relative_to(above_files).as_posix(): path
-                    for path, target in targets.items()
-                },
-            )
+            owned = out.parent if is_file else out
+            claim(owned, {to.relative_to(owned).as_posix(): path for path, to in targets.items()})
             for path, target in targets.items():
                 target.parent.mkdir(parents=True, exist_ok=True)
                 path.replace(target)

@@ -13,21 +13,16 @@ from worldpose.store.store import Run, Store
 
 @dataclass(frozen=True)
 class StageTime:
-    """Timing of one stage of a run.
-
-    Attributes:
-        stage: its name.
-        units: number of units that the run computed.
-        work: sum over its units, on all workers [s].
-        longest: longest time of one unit [s].
-        elapsed: time with at least one running unit [s].
-    """
+    """Timing of one stage of a run, and the number of units that it computed [s]."""
 
     stage: str
     units: int
     work: float
+    """Sum over its units, on all workers."""
     longest: float
+    """Of one unit."""
     elapsed: float
+    """With at least one running unit."""
 
 
 @dataclass(frozen=True)
@@ -68,9 +63,7 @@ class RunTime:
     """Timing of a run.
 
     Attributes:
-        run_id: its number.
         seconds: time from its start to its record [s].
-        stages: stages with computed units, in the method's order.
         start: until its first unit ran: planning, and the start of workers [s].
         between: after that, time without a running unit: planning, submitting, recording [s].
         cost: cost of all results of the run, also of those that earlier runs computed.
@@ -95,27 +88,20 @@ def run_time(store: Store, match_id: str, run_id: str) -> RunTime:
     manifests = {name: run.manifest(name) for name in record.results}
     spans: dict[str, list[tuple[float, float]]] = {}
     for name in record.executed:
-        stage, _, _ = name.partition("/")
-        manifest = manifests[name]
-        end = manifest.created_at.timestamp()
-        spans.setdefault(stage, []).append((end - manifest.seconds, end))
-    stages = tuple(
-        StageTime(
-            stage.name,
-            len(spans[stage.name]),
-            sum(end - begin for begin, end in spans[stage.name]),
-            max(end - begin for begin, end in spans[stage.name]),
-            _covered_length(spans[stage.name]),
-        )
-        for stage in METHOD
-        if stage.name in spans
-    )
+        end = manifests[name].created_at.timestamp()
+        span = end - manifests[name].seconds, end
+        spans.setdefault(name.partition("/")[0], []).append(span)
+    stages = []
+    for name in (stage.name for stage in METHOD if stage.name in spans):
+        own = [end - begin for begin, end in spans[name]]
+        elapsed = _covered_length(spans[name])
+        stages.append(StageTime(name, len(own), sum(own), max(own), elapsed))
     all_spans = [span for each in spans.values() for span in each]
     begun = record.started_at.timestamp()
     start = max(0.0, min((begin for begin, _ in all_spans), default=begun) - begun)
     between = max(0.0, record.seconds - start - _covered_length(all_spans))
     cost = Cost.of(manifests.values())
-    return RunTime(record.run_id, record.seconds, stages, start, between, cost)
+    return RunTime(record.run_id, record.seconds, tuple(stages), start, between, cost)
 
 
 def _covered_length(spans: Iterable[tuple[float, float]]) -> float:

@@ -29,6 +29,7 @@ from flows.results.run_cameras import (
 )
 from worldpose.body.body_file import is_open_body
 from worldpose.body.keypoints import HALPE26, fold_keypoints
+from worldpose.body.model import BodyParameters
 from worldpose.body.occlusions import hidden_joints
 from worldpose.errors import InputError, UsageError
 from worldpose.formats import motion_capture
@@ -161,9 +162,8 @@ def export_coco(origin: best_results.Origin, out: Path) -> Iterator[Path]:
 def export_alphapose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     """Write `alphapose/<clip>/<camera or broadcast view>.json` as `export_coco`."""
     for clip in origin.clips:
-        model, poses, persons = best_results.fitted_bodies(origin.run, clip)
+        model, poses, persons, frames = best_results.fitted_bodies(origin.run, clip)
         at_frames = fold_keypoints(model, HALPE26)(poses).swapaxes(0, 1)
-        frames = origin.run[best_results.bodies_unit(origin.run, clip)]["frame"].values
         for view in image_views(origin, clip, frames):
             if not view.is_used(clip):
                 continue
@@ -339,8 +339,8 @@ def _people_with_joints(tracks: JointTracks) -> Iterator[tuple[int, int]]:
 def export_motion(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     """Write `motion/<clip>/person_<id>_frame_<first>.bvh` for every uninterrupted interval."""
     for clip in origin.clips:
-        model, poses, _ = best_results.fitted_bodies(origin.run, clip)
-        for name, person, part in _motions(origin, clip):
+        model, poses, persons, frames = best_results.fitted_bodies(origin.run, clip)
+        for name, person, part in _motions(poses, persons, frames):
             path = out / "motion" / clip / f"{name}.bvh"
             motion_capture.write_motion(path, model, poses[person, part], origin.spec.fps)
             yield path
@@ -349,15 +349,14 @@ def export_motion(origin: best_results.Origin, out: Path) -> Iterator[Path]:
 def export_opensim(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     """Write `opensim/<clip>/person_<id>_frame_<first>.mot` for every uninterrupted interval."""
     for clip in origin.clips:
-        model, poses, persons = best_results.fitted_bodies(origin.run, clip)
-        frames = origin.run[best_results.bodies_unit(origin.run, clip)]["frame"].values
+        model, poses, persons, frames = best_results.fitted_bodies(origin.run, clip)
         kinds = best_results.person_kinds(origin.run, clip)
         notes = describe_clip(origin, clip) | {
             "world": "x as in the world of the match, y up, z = minus its y",
             "joints": motion_capture.OPENSIM_CONVENTION,
             "units": "degrees, metres, seconds; time is match frame / frames per second",
         }
-        for name, person, part in _motions(origin, clip):
+        for name, person, part in _motions(poses, persons, frames):
             path = out / "opensim" / clip / f"{name}.mot"
             motion_capture.write_opensim_motion(
                 path,
@@ -368,10 +367,10 @@ def export_opensim(origin: best_results.Origin, out: Path) -> Iterator[Path]:
             yield path
 
 
-def _motions(origin: best_results.Origin, clip: str) -> Iterator[tuple[str, int, slice]]:
+def _motions(
+    poses: BodyParameters, persons: NDArray[np.int32], frames: Integers
+) -> Iterator[tuple[str, int, slice]]:
     """Yield name, person index and frames of every uninterrupted interval of a clip's bodies."""
-    _, poses, persons = best_results.fitted_bodies(origin.run, clip)
-    frames = origin.run[best_results.bodies_unit(origin.run, clip)]["frame"].values
     for person, person_id in enumerate(persons):
         for part in motion_capture.stretches(poses[person]):
             yield f"person_{person_id:03d}_frame_{frames[part.start]:06d}", person, part
@@ -380,18 +379,13 @@ def _motions(origin: best_results.Origin, clip: str) -> Iterator[tuple[str, int,
 def export_scenes(
     origin: best_results.Origin, out: Path, suffix: str, write: Callable[..., None]
 ) -> Iterator[Path]:
-    """Write `scenes/<clip>.<suffix>`: bodies, cameras and the pitch.
-
-    Raises:
-        UsageError: a body model with terms of its own needs them for its surface.
-    """
+    """Write `scenes/<clip>.<suffix>`: bodies, cameras and the pitch."""
     # Imported here: it loads matplotlib's colours, which takes 0.5 s.
     from worldpose.reports.drawing import markings
 
     pitch = estimated_pitch(origin.run, origin.pitch, origin.spec)
     for clip in origin.clips:
-        model, poses, persons = best_results.fitted_bodies(origin.run, clip)
-        frames = origin.run[best_results.bodies_unit(origin.run, clip)]["frame"].values
+        model, poses, persons, frames = best_results.fitted_bodies(origin.run, clip)
         free = is_open_body(model.name)
         if origin.surface and not free and origin.licence is None:
             raise UsageError(

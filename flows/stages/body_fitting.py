@@ -40,17 +40,13 @@ def body_model_digest(
     return {"body_model_sha256": digest}
 
 
-STAGE = Stage(
+STAGE = tracking.of_clips(
     name="body_fitting",
     about="fit a body to every person",
     settings=BodyFittingSettings,
-    units=tracking.units,
     inputs=inputs,
     sources=sources,
-    previous_pass_inputs=tracking.filtering_inputs,
-    late_inputs=detection.again_by_cameras,
     external_inputs=body_model_digest,
-    needs_static_cameras=True,
 )
 
 

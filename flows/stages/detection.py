@@ -42,14 +42,10 @@ def seen_in_broadcast(match: Match, view: str) -> tuple[str, ...]:
     return (f"detection/{view}",) if view in _units(match) else ()
 
 
-def units(match: Match) -> tuple[str, ...]:
-    """Return `camera.clip` of static cameras without 2D poses, then such broadcast views."""
-    return tuple(_units(match))
-
-
+@once_a_match
 @once_a_match
 def _units(match: Match) -> dict[str, tuple[str, str]]:
-    """Return the unit of `ingest` and the clip of each unit."""
+    """Return the unit of `ingest` and the clip of each unit, without given 2D poses."""
     folder, views = match.folder, match.folder.spec.broadcast_views
     found = [unit for unit in ingest.units(match) if unit not in folder.detections]
     return {
@@ -97,7 +93,7 @@ STAGE = Stage(
     name="detection",
     about="find people and their keypoints in videos",
     settings=DetectionSettings,
-    units=units,
+    units=lambda match: tuple(_units(match)),
     inputs=inputs,
     sources=sources,
     external_inputs=outside,

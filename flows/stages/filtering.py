@@ -16,23 +16,16 @@ from flows.stages import body_fitting, detection, tracking, triangulation
 from worldpose.detection.settings import RedetectionSettings
 from worldpose.filtering.settings import FilteringSettings
 
-
-def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """Return the last fitted bodies, the cameras, their detections, and the tracks."""
-    placed = (f"retriangulation/{unit}", body_fitting.last_bodies(match, unit))
-    return (*triangulation.retriangulation_inputs(match, unit), *placed)
-
-
-STAGE = Stage(
+STAGE = tracking.of_clips(
     name="filtering",
     about="find the keypoints and boxes that bodies contradict",
     settings=FilteringSettings,
-    units=tracking.units,
-    inputs=inputs,
+    inputs=lambda match, unit: (
+        *triangulation.retriangulation_inputs(match, unit),
+        f"retriangulation/{unit}",
+        body_fitting.last_bodies(match, unit),
+    ),
     sources=tracking.clip_sources,
-    previous_pass_inputs=tracking.filtering_inputs,
-    late_inputs=detection.again_by_cameras,
-    needs_static_cameras=True,
 )
 
 
@@ -48,12 +41,6 @@ def _searched(match: Match) -> dict[str, tuple[str, str]]:
     }
 
 
-def redetection_inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """Return the index of the video, and the detections."""
-    camera, clip = _searched(match)[unit]
-    return (f"ingest/{camera}", detection.seen_by(match, camera, clip))
-
-
 def redetection_inputs_from_before(match: Match, unit: str) -> tuple[str, ...]:
     """Return the adjusted cameras, the last fitted bodies, and the filtering results."""
     _, clip = _searched(match)[unit]
@@ -64,8 +51,7 @@ def redetection_inputs_from_before(match: Match, unit: str) -> tuple[str, ...]:
 
 def redetection_sources(match: Match, unit: str) -> dict[str, JsonValue]:
     """Return camera and clip; `detection` has all other sources."""
-    camera, clip = _searched(match)[unit]
-    return {"camera": camera, "clip": clip}
+    return dict(zip(("camera", "clip"), _searched(match)[unit], strict=True))
 
 
 def seen_in(run: Container[str], match: Match, camera_id: str, clip_id: str) -> str:
@@ -83,7 +69,11 @@ REDETECTION = Stage(
     about="look again for people where bodies say they must be",
     settings=RedetectionSettings,
     units=lambda match: tuple(_searched(match)),
-    inputs=redetection_inputs,
+    # The index of the video, and the detections.
+    inputs=lambda match, unit: (
+        f"ingest/{_searched(match)[unit][0]}",
+        detection.seen_by(match, *_searched(match)[unit]),
+    ),
     sources=redetection_sources,
     previous_pass_inputs=redetection_inputs_from_before,
     first_pass=2,

@@ -31,11 +31,6 @@ def proposed_cameras(match: Match) -> dict[str, str | None]:
     return {each.id: each.side for each in folder.spec.static_cameras if each.id not in known}
 
 
-def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """Return the camera's given 2D poses or the index of its video, if people decide."""
-    return (f"ingest/{unit}",) if _needs_people(match) else ()
-
-
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
     """Return the camera's image, pitch and lens, its stated side, and the clips with people."""
     folder = match.folder
@@ -52,11 +47,6 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
         "fps": folder.spec.fps,
         "people": people,
     }
-
-
-def external_inputs(match: Match, settings: ProposalSettings) -> dict[str, JsonValue]:
-    """Return the versions of the libraries that run the bundled detector."""
-    return detection.outside(match, DetectionSettings())
 
 
 def needed_proposals(match: Match, unit: str) -> tuple[str, ...]:
@@ -110,8 +100,10 @@ STAGE = Stage(
     about="propose the cameras without clicks",
     settings=ProposalSettings,
     units=units,
-    inputs=inputs,
+    # The given 2D poses or the index of the video, if people decide.
+    inputs=lambda match, unit: (f"ingest/{unit}",) if _needs_people(match) else (),
     sources=sources,
-    external_inputs=external_inputs,
+    # The versions of the libraries that run the bundled detector.
+    external_inputs=lambda match, settings: detection.outside(match, DetectionSettings()),
     needs_static_cameras=True,
 )

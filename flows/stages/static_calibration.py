@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from flows.stage import Match, Stage
+from flows.stage import Stage
 from flows.stages.proposal import camera_sources, needed_proposals
 from worldpose.static_calibration.settings import StaticCalibrationSettings
-
-
-def units(match: Match) -> tuple[str, ...]:
-    """Return the static cameras in order."""
-    return tuple(camera.id for camera in match.folder.spec.static_cameras)
-
 
 STAGE = Stage(
     name="static_calibration",
     about="find every static camera from clicked or proposed markings",
     settings=StaticCalibrationSettings,
-    units=units,
+    units=lambda match: tuple(camera.id for camera in match.folder.spec.static_cameras),
     inputs=needed_proposals,
     sources=camera_sources,
     leaves_out=True,

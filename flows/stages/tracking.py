@@ -1,7 +1,6 @@
 """Stage `tracking`: one unit per clip, from all static cameras."""
 
-from __future__ import annotations
-
+from functools import partial
 from typing import Final
 
 from pydantic import JsonValue
@@ -20,11 +19,6 @@ def units(match: Match) -> tuple[str, ...]:
     """Return the clips; none without static cameras."""
     clips = match.folder.spec.clips if match.has_static_cameras else ()
     return tuple(clip.id for clip in clips)
-
-
-def inputs_from_before(match: Match, unit: str) -> tuple[str, ...]:
-    """Return cameras adjusted to people, and the filtering results."""
-    return ("bundle_adjustment/cameras", *filtering_inputs(match, unit))
 
 
 def filtering_inputs(match: Match, unit: str) -> tuple[str, ...]:
@@ -83,15 +77,27 @@ def clock_sources(match: Match) -> dict[str, JsonValue]:
     return {} if is_whole else {"clocks": [each.clock for each in clocks]}
 
 
-STAGE = Stage(
+of_clips = partial(
+    Stage,
+    units=units,
+    previous_pass_inputs=filtering_inputs,
+    late_inputs=detection.again_by_cameras,
+    needs_static_cameras=True,
+)
+"""A stage with one unit per clip, without what the previous iteration rejected."""
+
+
+def inputs_from_before(match: Match, unit: str) -> tuple[str, ...]:
+    """Return cameras adjusted to people, and the filtering results."""
+    return ("bundle_adjustment/cameras", *filtering_inputs(match, unit))
+
+
+STAGE = of_clips(
     name="tracking",
     about="identify people across cameras and over time",
     settings=TrackingSettings,
-    units=units,
     inputs=camera_inputs,
     sources=sources,
     previous_pass_inputs=inputs_from_before,
-    late_inputs=detection.again_by_cameras,
     min_cameras=MIN_CAMERAS,
-    needs_static_cameras=True,
 )

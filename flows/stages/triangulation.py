@@ -4,14 +4,9 @@ from __future__ import annotations
 
 from pydantic import JsonValue
 
-from flows.stage import Match, Stage
+from flows.stage import Match
 from flows.stages import detection, tracking
 from worldpose.triangulation.settings import TriangulationSettings
-
-
-def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """Return every static camera, its detections, and the tracks."""
-    return (*tracking.camera_inputs(match, unit), f"tracking/{unit}")
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
@@ -20,16 +15,13 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
     return {**tracking.clip_sources(match, unit), "match_frames": frames}
 
 
-STAGE = Stage(
+STAGE = tracking.of_clips(
     name="triangulation",
     about="place every joint from the cameras that agree",
     settings=TriangulationSettings,
-    units=tracking.units,
-    inputs=inputs,
+    inputs=lambda match, unit: (*tracking.camera_inputs(match, unit), f"tracking/{unit}"),
     sources=sources,
     previous_pass_inputs=tracking.inputs_from_before,
-    late_inputs=detection.again_by_cameras,
-    needs_static_cameras=True,
 )
 
 
@@ -44,14 +36,10 @@ def retriangulation_inputs(match: Match, unit: str) -> tuple[str, ...]:
     return (*adjusted_inputs(match, unit), f"triangulation/{unit}")
 
 
-RETRIANGULATION = Stage(
+RETRIANGULATION = tracking.of_clips(
     name="retriangulation",
     task_file="triangulation",
     about="place every joint again with the adjusted cameras",
-    units=tracking.units,
     inputs=retriangulation_inputs,
     sources=tracking.clip_sources,
-    previous_pass_inputs=tracking.filtering_inputs,
-    late_inputs=detection.again_by_cameras,
-    needs_static_cameras=True,
 )

@@ -74,7 +74,7 @@ def parts(ada):
 
 def test_the_page_gets_the_bodies_of_the_store(reader, tiny_run):
     scene, ranges = parts(reader)
-    model, poses, persons = fitted_bodies(open_run(str(tiny_run), TINY), "clip")
+    model, poses, persons, _ = fitted_bodies(open_run(str(tiny_run), TINY), "clip")
     header, _ = decode_part(scene)
     assert [person["id"] for person in header["people"]] == persons.tolist()
     assert {person["kind"] for person in header["people"]} == {"triangulated"}

@@ -157,7 +157,7 @@ def test_alphapose_results_are_the_projected_bodies(match_folder, tmp_path):
     # The second person is missing in the third frame, and the camera in the last.
     shown = [("0.jpg", 3), ("0.jpg", 8), ("1.jpg", 3), ("1.jpg", 8), ("2.jpg", 3)]
     assert [(each["image_id"], each["idx"]) for each in entries] == shown
-    model, poses, _ = best_results.fitted_bodies(run.run, "A_1")
+    model, poses, *_ = best_results.fitted_bodies(run.run, "A_1")
     world = fold_keypoints(model, HALPE26)(poses)[0, 0]
     # From 70 m in front of the centre spot and 2 m up, with 4000 px.
     across = 960.0 + 4000.0 * world[:, 0] / (world[:, 1] + 70.0)

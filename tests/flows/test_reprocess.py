@@ -70,7 +70,7 @@ def test_an_edit_makes_what_was_made_from_it_stale_and_nothing_else(store, edit)
     expected = made_from(store, *starts)
     assert {unit.unit for unit in found.units} == expected
     assert len(found.to_compute) == len(expected)
-    assert {unit.unit for unit in found.units if unit.own_reasons} == set(starts)
+    assert {unit.planned.name for unit in found.units if unit.own_reasons} == set(starts)
 
 
 def test_new_code_makes_what_is_computed_with_it_stale(store, monkeypatch):
@@ -119,7 +119,7 @@ def test_what_failed_is_tried_again_when_something_is_another(store, error, agai
     finish(store, state="failed", results=results, failed=(failure,), figures={}, reused=())
     assert run_status(store, TINY).is_stale == again
     told = f"run {TINY}/0002 failed with the same input and settings: x"
-    assert explain_unit(store, f"{TINY}/tracking/clip", {}).reasons == (told,)
+    assert explain_unit(store, f"{TINY}/tracking/clip", {})["reasons"] == (told,)
     if not again:
         said = CliRunner().invoke(app, ["reprocess", "--project", store.url]).stdout
         assert "nothing was edited since run 0002, which is failed; --retry" in " ".join(
@@ -135,10 +135,10 @@ def test_a_later_iteration_is_stale_in_every_pass(store):
     finish(store, iteration=2)
     found = run_status(store, TINY)
     # Nothing of the second pass is there; the first pass stands in the run before.
-    assert {unit.iteration for unit in found.units} == {2}
+    assert {unit.planned.iteration for unit in found.units} == {2}
     edit_box(store)
     found = run_status(store, TINY)
-    assert {unit.iteration for unit in found.units} == {1, 2}
+    assert {unit.planned.iteration for unit in found.units} == {1, 2}
     assert len({unit.key for unit in found.to_compute}) == len(found.to_compute)
 
 

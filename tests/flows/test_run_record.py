@@ -63,7 +63,7 @@ def test_a_run_during_an_edit_has_the_match_as_it_began_and_the_edit_is_seen_nex
     assert record.results == before.results, "no unit of the edited match is among the others"
     found = run_status(store, TINY)
     assert found.latest.run_id == record.run_id
-    assert {unit.unit for unit in found.units if unit.own_reasons} == {"tracking/clip"}
+    assert {unit.planned.name for unit in found.units if unit.own_reasons} == {"tracking/clip"}
 
 
 def test_iterations_begin_again_when_the_match_is_edited_between_two(store, monkeypatch):
