@@ -87,7 +87,7 @@ class BundledDetector:
                 some = numbers[start : start + self._net.batch]
                 order += some
                 maps.append(self._net(pad([views[number] for number in some], sides)))
-        rows = decode_boxes(maps, MIN_SCORE).cpu().numpy().astype(np.float64)
+        rows = decode_boxes(maps, MIN_SCORE).cpu().numpy()
         ends = np.searchsorted(rows[:, 0], np.arange(len(order) + 1))
         high = np.array(shapes)[order][rows[:, 0].astype(int)][:, [1, 0, 1, 0]] - 0.5
         boxes = np.clip(rows[:, 1:5], -0.5, high)
