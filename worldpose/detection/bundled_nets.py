@@ -366,7 +366,8 @@ def _find_candidates(chance: Singles, count: int, least: np.float32) -> tuple[Si
             y, x = divmod(block, width // 4)
             cell = chance[k, 4 * y : 4 * y + 4, 4 * x : 4 * x + 4].argmax()
             row, column = 4 * y + cell // 4, 4 * x + cell % 4
-            if not _is_peak(chance[k], row, column):
+            near = chance[k, max(row - 3, 0) : row + 4, max(column - 3, 0) : column + 4]
+            if chance[k, row, column] < near.max():
                 continue
             total = right = below = 0.0
             for i in range(max(row - 2, 0), min(row + 3, height)):
@@ -384,17 +385,6 @@ def _find_candidates(chance: Singles, count: int, least: np.float32) -> tuple[Si
                 places[k, rank, 0] = CELL * right / total + 0.5 * (CELL - 1)
                 places[k, rank, 1] = CELL * below / total + 0.5 * (CELL - 1)
     return places, masses
-
-
-@compile_kernel
-def _is_peak(chance: Singles, row: int, column: int) -> bool:
-    """Return whether no cell within three of a cell is higher."""
-    high = chance[row, column]
-    for i in range(max(row - 3, 0), min(row + 4, chance.shape[0])):
-        for j in range(max(column - 3, 0), min(column + 4, chance.shape[1])):
-            if chance[i, j] > high:
-                return False
-    return True
 
 
 def save_weights(path: Path, net: nn.Module, about: dict[str, str] | None = None) -> None:

@@ -55,13 +55,7 @@ def frame_from_crop(
     return np.concatenate([linear, (crop[..., :2] - linear @ middle)[..., None]], axis=-1)
 
 
-def cut_crop(
-    image: Image,
-    mapping: Floats,
-    size: tuple[int, int],
-    outside: int = OUTSIDE,
-    into: Image | None = None,
-) -> Image:
+def cut_crop(image: Image, mapping: Floats, size: tuple[int, int], outside: int = OUTSIDE) -> Image:
     """Return a crop (height, width, 3), grey outside of the frame.
 
     Args:
@@ -69,7 +63,6 @@ def cut_crop(
         mapping: (2, 3) affine map from pixels of the crop to those of the frame.
         size: width, height of the crop [px].
         outside: grey level outside of the frame [of 255].
-        into: array to which the crop is written; None = a new one.
     """
     shrink = float(_scale(mapping))
     if shrink > 2.0:
@@ -80,7 +73,6 @@ def cut_crop(
             image,
             mapping,
             size,
-            into,
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=(outside, outside, outside),

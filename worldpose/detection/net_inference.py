@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn.functional import pad
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from worldpose.detection.bundled_nets import Block, normalize
@@ -113,18 +114,14 @@ class PlacedNet:
             return self._net(*given)
         count = len(given[0])
         placed = (torch.as_tensor(each, device=self.device) for each in given)
-        images, *maps = (_fill(each, -count % min(self._fill, self.batch)) for each in placed)
+        missing = -count % min(self._fill, self.batch)
+        images, *maps = (pad(each, [0, 0] * (each.ndim - 1) + [0, missing]) for each in placed)
         images = normalize(images)
         outputs: Tensors = self._net(*(each.to(self._kind) for each in (images, *maps)))
         if count == len(images):
             return outputs
         # Parameters of the net, among the outputs, have no row per image.
         return tuple(each[:count] if len(each) == len(images) else each for each in outputs)
-
-
-def _fill(given: Tensor, missing: int) -> Tensor:
-    """Return the given rows and some further ones of zeros."""
-    return torch.cat([given, given.new_zeros(missing, *given.shape[1:])]) if missing else given
 
 
 def run_together(

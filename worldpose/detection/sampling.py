@@ -137,8 +137,8 @@ def sample_crops(
     else:
         crops = borrow("crops", (len(flat), CROP[1], CROP[0], 3))
         for image, (a, b) in shared:
-            for crop, mapping in zip(crops[a:b], mappings[a:b], strict=True):
-                cut_crop(np.asarray(image), mapping, CROP, into=crop)
+            for number in range(a, b):
+                crops[number] = cut_crop(np.asarray(image), mappings[number], CROP)
     return mappings, crops, surroundings(flat, others, mappings, CROP)
 
 
