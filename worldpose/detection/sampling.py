@@ -146,7 +146,7 @@ def _sample(frame: Frame, mappings: Floats) -> Tensor:
     """Return upright crops of a frame; where a pixel covers several, the mean of as many."""
     image = torch.as_tensor(frame)
     planes = image.permute(2, 0, 1)[None].float() - OUTSIDE
-    crops = image.new_empty((len(mappings), CROP[1], CROP[0], 3))
+    crops = image.new_empty((len(mappings), 3, CROP[1], CROP[0]))
     finer = np.maximum(mappings[:, 0, 0].astype(int), 1)
     for count in np.unique(finer):
         rows = finer == count
@@ -159,7 +159,5 @@ def _sample(frame: Frame, mappings: Floats) -> Tensor:
         grid = torch.stack([x, y], dim=-1).flatten(0, 1)[None]
         seen = functional.grid_sample(planes, grid, align_corners=False)
         mean = functional.avg_pool2d(seen.view(3, *x.shape).transpose(0, 1), int(count))
-        crops[torch.from_numpy(rows).to(image.device)] = (
-            (mean + OUTSIDE).round().to(torch.uint8).permute(0, 2, 3, 1)
-        )
-    return crops
+        crops[torch.from_numpy(rows).to(image.device)] = (mean + OUTSIDE).round().to(torch.uint8)
+    return crops.permute(0, 2, 3, 1).contiguous()
