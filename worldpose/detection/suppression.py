@@ -133,7 +133,7 @@ def suppress_poses(
         found &= np.isfinite(detections.keypoints).all(axis=2)
     detections = detections.without(~found)
     alike = object_keypoint_similarity(detections.keypoints, box_areas(detections.boxes))
-    kept, shown = np.zeros(len(detections.score), dtype=np.bool_), found.any(axis=1)
+    kept, shown = np.zeros(len(detections.score), dtype=np.bool_), np.asarray(found.any(axis=1))
     score = detections.score.copy()
     for row in np.argsort(-detections.score, kind="stable"):
         most = alike[row, kept].max(initial=0.0)
