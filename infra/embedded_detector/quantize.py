@@ -140,7 +140,7 @@ def quantize(
     kept: Sequence[str],
     weights: Path,
 ) -> None:
-    """Write a net in integers, which takes images of bytes (batch, 3, height, width).
+    """Write a net in integers, which takes images of bytes (batch, height, width, 3).
 
     Args:
         net: placed, so that its normalisations are folded.
@@ -192,9 +192,10 @@ def quantize(
 
 
 def take_bytes(model: onnx.ModelProto) -> None:
-    """Change the first input to bytes: they are the quantized input as it is.
+    """Change the first input to bytes (batch, height, width, 3): they are its integers as they are.
 
-    The scale of normalized images is that of grey levels, and their zero the mean grey level.
+    The scale of normalized images is that of grey levels, and their zero the mean grey level. The
+    runtime computes with channels last, so that the transposition costs nothing.
     """
     graph = model.graph
     (first,) = (n for n in graph.node if n.op_type == "QuantizeLinear" and n.input[0] == "images")
@@ -209,10 +210,14 @@ def take_bytes(model: onnx.ModelProto) -> None:
     for node in graph.node:
         for index, name in enumerate(node.input):
             if name == first.output[0]:
-                node.input[index] = "images"
+                node.input[index] = "planes"
     graph.node.remove(first)
+    graph.node.insert(0, helper.make_node("Transpose", ["images"], ["planes"], perm=[0, 3, 1, 2]))
     (given,) = (each for each in graph.input if each.name == "images")
     given.type.tensor_type.elem_type = TensorProto.UINT8
+    sides = list(given.type.tensor_type.shape.dim)
+    del given.type.tensor_type.shape.dim[:]
+    given.type.tensor_type.shape.dim.extend(sides[k] for k in (0, 2, 3, 1))
 
 
 def main() -> None:

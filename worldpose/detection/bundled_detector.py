@@ -39,8 +39,10 @@ class BundledDetector:
 
     Without a camera, a pass over the reduced frame tells the size of its people: a frame of large
     people is seen reduced. A frame without sure people may be a close-up: it is seen at the size at
-    which its surest person is surest.
+    which its surest person is surest. It takes whole frames of any size.
     """
+
+    view_size = None
 
     def __init__(
         self, net: PeopleNet | QuantizedNet, device: str = "cpu", half: bool = False
@@ -48,11 +50,6 @@ class BundledDetector:
         self._net = PlacedNet(net, device, half)
         # On a GPU, parts of more different sizes are computed at once [px].
         self._multiple = COARSEST if self._net.device == "cpu" else 4 * COARSEST
-
-    @property
-    def view_size(self) -> None:
-        """None: the detector takes whole frames of any size."""
-        return
 
     def detect(self, images: Sequence[Image]) -> list[People]:
         """Return the people in each frame."""
@@ -87,7 +84,7 @@ class BundledDetector:
                 some = numbers[start : start + self._net.batch]
                 order += some
                 maps.append(self._net(pad([views[number] for number in some], sides)))
-        rows = decode_boxes(maps, MIN_SCORE).cpu().numpy().astype(np.float64)
+        rows = decode_boxes(maps, MIN_SCORE).cpu().numpy()
         ends = np.searchsorted(rows[:, 0], np.arange(len(order) + 1))
         high = np.array(shapes)[order][rows[:, 0].astype(int)][:, [1, 0, 1, 0]] - 0.5
         boxes = np.clip(rows[:, 1:5], -0.5, high)

@@ -11,18 +11,21 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from itertools import accumulate, pairwise
+from itertools import pairwise
 from pathlib import Path
 from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
 
+from data_contracts.arrays import Floats, Singles
 from data_contracts.conventions import COCO17
+from worldpose.compiled import compile_kernel
 from worldpose.detection.crops import MAP_COUNT
 from worldpose.detection.sampling import borrow
 from worldpose.errors import InputError
@@ -244,53 +247,43 @@ def decode_boxes(maps: Sequence[tuple[Tensor, ...]], least: float) -> Tensor:
             bottom [px].
         least: lowest score reported.
     """
-    each_cell = torch.cat([logits.flatten() for logits, _ in maps])
-    cell = torch.nonzero(each_cell >= math.log(least / (1.0 - least)))[:, 0]
-    sizes = [one.shape for logits, _ in maps for one in logits]
-    rows, columns = torch.tensor(sizes, device=cell.device).unbind(dim=1)
-    first = (rows * columns).cumsum(0) - rows * columns
-    image = torch.searchsorted(first, cell, right=True) - 1
-    rows, columns, first = rows[image, None], columns[image, None], first[image]
-    place = cell - first
-    row, column = place // columns[:, 0], place % columns[:, 0]
-    step = torch.arange(-1, 2, device=cell.device)
-    y = (row[:, None] + step).clamp(min=0).minimum(rows - 1) * columns + first[:, None]
-    x = (column[:, None] + step).clamp(min=0).minimum(columns - 1)
-    near = each_cell.take(y[:, :, None] + x[:, None, :]).flatten(1)
-    peak = near[:, 4] == near.amax(dim=1)
-    image, row, column, place, logit = (
-        each[peak] for each in (image, row, column, place, near[:, 4])
-    )
-    ends = [0, *accumulate(len(logits) for logits, _ in maps)]
-    cuts = torch.searchsorted(image, torch.tensor(ends, device=image.device)).tolist()
-    sides = [
-        each.flatten(2)[image[a:b] - end, :, place[a:b]]
-        for (_, each), end, (a, b) in zip(maps, ends, pairwise(cuts), strict=False)
-    ]
-    left, top, right, bottom = torch.cat(sides).unbind(dim=1)
-    x, y = (STRIDE * at + 0.5 * (STRIDE - 1) for at in (column, row))
-    # PyTorch rounds the last numbers of an array otherwise, which double precision makes harmless.
-    score = torch.sigmoid(logit.double())
-    return torch.stack([image, x - left, y - top, x + right, y + bottom, score], dim=1)
+    limit, first, found = math.log(least / (1.0 - least)), 0, list[Tensor]()
+    for logits, sides in maps:
+        if logits.is_cpu:
+            cells = np.flatnonzero(logits.numpy() >= limit)
+            rows = torch.from_numpy(_find_boxes(logits.numpy(), sides.numpy(), cells))
+        else:
+            high = functional.max_pool2d(logits, 3, stride=1, padding=1)
+            image, row, column = torch.nonzero((logits == high) & (logits >= limit), as_tuple=True)
+            left, top, right, bottom = sides[image, :, row, column].unbind(dim=1)
+            x, y = (STRIDE * at + 0.5 * (STRIDE - 1) for at in (column, row))
+            each = (image, x - left, y - top, x + right, y + bottom, logits[image, row, column])
+            rows = torch.stack([one.double() for one in each], dim=1)
+        rows[:, 0] += first
+        first += len(logits)
+        found.append(rows)
+    people = torch.cat(found)
+    people[:, 5].sigmoid_()
+    return people
 
 
-def _around(maps: Tensor, cells: Sequence[Tensor], step: Tensor, beyond: float = 1.0) -> Tensor:
-    """Return the values of maps (batch, rows, columns) around cells (cells, steps, steps).
-
-    Args:
-        maps: (batch, rows, columns).
-        cells: index of the map, row and column of each cell.
-        step: distances along both axes (steps,).
-        beyond: factor on the nearest value, where a place is beyond the border.
-    """
-    index, places = cells[0], [at[:, None] + step for at in cells[1:]]
-    y, x = (at.clamp(0, count - 1) for at, count in zip(places, maps.shape[1:], strict=True))
-    row = (index[:, None] * maps.shape[1] + y) * maps.shape[2]
-    values = maps.take(row[:, :, None] + x[:, None, :])
-    if beyond != 1.0:
-        shares = [torch.where(a == b, 1.0, beyond) for a, b in zip((y, x), places, strict=True)]
-        values = values * shares[0][:, :, None] * shares[1][:, None, :]
-    return values
+@compile_kernel
+def _find_boxes(logits: Singles, sides: Singles, cells: NDArray[np.intp]) -> Floats:
+    """Return the rows of `decode_boxes` of one map, with logits for scores, at flat `cells`."""
+    height, width = logits.shape[1:]
+    found, count = np.empty((len(cells), 6)), 0
+    for cell in cells:
+        image, place = divmod(cell, height * width)
+        row, column = divmod(place, width)
+        near = logits[image, max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+        if logits[image, row, column] == near.max():
+            found[count, 0], found[count, 5] = image, logits[image, row, column]
+            for axis, at in enumerate((column, row)):
+                middle = np.float32(STRIDE * at + 0.5 * (STRIDE - 1))
+                found[count, 1 + axis] = middle - sides[image, axis, row, column]
+                found[count, 3 + axis] = middle + sides[image, 2 + axis, row, column]
+            count += 1
+    return found[:count]
 
 
 def _means(chance: Tensor, cells: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
@@ -301,7 +294,10 @@ def _means(chance: Tensor, cells: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         cells: index of the map, row and column of each cell.
     """
     step = torch.arange(-2, 3, device=chance.device)
-    near = _around(chance, cells, step, 0.0)
+    index, row, column = (each[:, None, None] for each in cells)
+    y, x = row + step[:, None], column + step
+    inside = [at.clamp(0, count - 1) for at, count in zip((y, x), chance.shape[1:], strict=True)]
+    near = chance[index, inside[0], inside[1]] * ((inside[0] == y) & (inside[1] == x))
     mass = near.sum(dim=(1, 2))
     x = cells[2] + (near * step).sum(dim=(1, 2)) / mass
     y = cells[1] + (near * step[:, None]).sum(dim=(1, 2)) / mass
@@ -322,43 +318,73 @@ def decode_candidates(maps: Tensor, count: int) -> tuple[Tensor, Tensor]:
         Positions (batch, joints, count, 2) [px of the crop], and the probability around each
         (batch, joints, count); 0 where a map has fewer peaks with a probability of 0.01.
     """
-    shape, (rows, columns) = maps.shape[:2], maps.shape[2:]
-    flat = maps.flatten(2)
-    out = torch.from_numpy(borrow("chance", flat.shape, np.float32)) if maps.is_cpu else None
-    chance = torch.softmax(flat, dim=-1, out=out).view(-1, rows, columns)
-    # Two peaks never share one of the blocks of 4 x 4 cells, and few of these are likely.
-    high = _larger_half(_larger_half(chance.view(-1, rows // 4, 4 * columns))).unflatten(2, (-1, 4))
-    high = torch.maximum(*torch.maximum(high[..., :2], high[..., 2:]).unbind(dim=-1))
+    shape, flat = maps.shape[:2], maps.flatten(0, 1)
     # Candidate positions of less probability are dropped, except the likeliest of a joint [1].
-    min_mass = 0.01
-    least = high.amax(dim=(1, 2), keepdim=True).clamp(max=min_mass / 25.0)
-    index, row, column = torch.nonzero(high >= least, as_tuple=True)
-    step = torch.arange(-3, 4, device=maps.device)
-    first = (4 * index * high.shape[1] + 4 * row) * high.shape[2] + column
-    four = first[:, None] + high.shape[2] * step[3:]  # the block's rows of four cells
-    best = chance.view(-1, 4).index_select(0, four.flatten()).view(-1, 16).max(dim=1)
-    row, column = 4 * row + best.indices // 4, 4 * column + best.indices % 4
-    high = best.values
-    for reach in (1, 3):  # most of these cells have a higher direct neighbour
-        near = _around(chance, (index, row, column), step[3 - reach : 4 + reach])
-        peak = high == near.flatten(1).amax(dim=1)
-        index, row, column, high = index[peak], row[peak], column[peak], high[peak]
-    at, mass = _means(chance, (index, row, column))
-    order = torch.argsort(mass, descending=True, stable=True)
-    order = order[torch.argsort(index[order], stable=True)]
-    index = index[order]
-    rank = torch.arange(len(order), device=maps.device) - torch.searchsorted(index, index)
-    order, index, rank = order[rank < count], index[rank < count], rank[rank < count]
-    places = maps.new_zeros(len(chance), count, 2)
-    masses = maps.new_zeros(len(chance), count)
-    places[index, rank] = at[order]
-    masses[index, rank] = mass[order]
+    least = 0.01 / 25.0
+    if maps.is_cpu:
+        given = borrow("chance", flat.shape, np.float32)
+        torch.softmax(flat.flatten(1), dim=1, out=torch.from_numpy(given).flatten(1))
+        places, masses = map(torch.from_numpy, _find_candidates(given, count, np.float32(least)))
+    else:
+        chance = torch.softmax(flat.flatten(1), dim=1).view_as(flat)
+        peak = chance == functional.max_pool2d(chance, 7, stride=1, padding=3)
+        peak &= chance >= chance.amax(dim=(1, 2), keepdim=True).clamp(max=least)
+        cells = torch.nonzero(peak, as_tuple=True)
+        at, mass = _means(chance, cells)
+        order = torch.argsort(mass, descending=True, stable=True)
+        order = order[torch.argsort(cells[0][order], stable=True)]
+        index = cells[0][order]
+        rank = torch.arange(len(order), device=maps.device) - torch.searchsorted(index, index)
+        order, index, rank = order[rank < count], index[rank < count], rank[rank < count]
+        places, masses = (maps.new_zeros(len(flat), count, *each) for each in ((2,), ()))
+        places[index, rank], masses[index, rank] = at[order], mass[order]
     return places.view(*shape, count, 2), masses.view(*shape, count)
 
 
-def _larger_half(each: Tensor) -> Tensor:
-    """Return the elementwise maximum of both halves of rows (..., n): faster than along an axis."""
-    return torch.maximum(*each.chunk(2, dim=-1))
+@compile_kernel
+def _find_candidates(chance: Singles, count: int, least: np.float32) -> tuple[Singles, Singles]:
+    """Return positions (maps, count, 2) and masses (maps, count) of maps of probabilities."""
+    number, height, width = chance.shape
+    places = np.zeros((number, count, 2), dtype=np.float32)
+    masses = np.zeros((number, count), dtype=np.float32)
+    four = np.empty(width, dtype=np.float32)
+    high = np.empty((height // 4, width // 4), dtype=np.float32)
+    for k in range(number):
+        # Two peaks never share one of the blocks of 4 x 4 cells, and few of these are likely.
+        for y in range(height // 4):
+            rows = chance[k, 4 * y : 4 * y + 4]
+            for x in range(width):
+                four[x] = max(max(rows[0, x], rows[1, x]), max(rows[2, x], rows[3, x]))
+            for x in range(width // 4):
+                left, right = (
+                    max(four[4 * x], four[4 * x + 1]),
+                    max(four[4 * x + 2], four[4 * x + 3]),
+                )
+                high[y, x] = max(left, right)
+        limit = min(least, high.max())
+        for block in np.flatnonzero(high >= limit):
+            y, x = divmod(block, width // 4)
+            cell = chance[k, 4 * y : 4 * y + 4, 4 * x : 4 * x + 4].argmax()
+            row, column = 4 * y + cell // 4, 4 * x + cell % 4
+            near = chance[k, max(row - 3, 0) : row + 4, max(column - 3, 0) : column + 4]
+            if chance[k, row, column] < near.max():
+                continue
+            total = right = below = 0.0
+            for i in range(max(row - 2, 0), min(row + 3, height)):
+                for j in range(max(column - 2, 0), min(column + 3, width)):
+                    total += chance[k, i, j]
+                    right += chance[k, i, j] * j
+                    below += chance[k, i, j] * i
+            mass, rank = np.float32(total), 0
+            while rank < count and masses[k, rank] >= mass:
+                rank += 1
+            if rank < count:
+                masses[k, rank + 1 :] = masses[k, rank:-1].copy()
+                places[k, rank + 1 :] = places[k, rank:-1].copy()
+                masses[k, rank] = mass
+                places[k, rank, 0] = CELL * right / total + 0.5 * (CELL - 1)
+                places[k, rank, 1] = CELL * below / total + 0.5 * (CELL - 1)
+    return places, masses
 
 
 def save_weights(path: Path, net: nn.Module, about: dict[str, str] | None = None) -> None:

@@ -70,13 +70,8 @@ class CropEstimates:
 
     def poses(self, taken: NDArray[np.intp]) -> KeypointDetections:
         """Return the poses whose joints are at the chosen candidates (people, 17)."""
-        one = taken[..., None]
-        return KeypointDetections(
-            np.take_along_axis(self.places, one[..., None], axis=2)[:, :, 0],
-            np.take_along_axis(self.sure, one, axis=2)[:, :, 0],
-            self.boxes,
-            self.fit,
-        )
+        chosen = (*np.ogrid[: len(taken), : len(COCO17)], taken)
+        return KeypointDetections(self.places[chosen], self.sure[chosen], self.boxes, self.fit)
 
 
 Crops = tuple[Floats, Sequence[Floats]]
@@ -209,24 +204,21 @@ def assign_joints(places: Floats, mass: Floats, boxes: Floats) -> NDArray[np.int
     np.fill_diagonal(near, False)
     longer = np.max(boxes[:, 2:] - boxes[:, :2], axis=1)
     order = np.argsort(-mass[..., 0].mean(axis=1), kind="stable")
-    other_side = np.array(COCO17_FLIP)
-    paired = other_side != np.arange(joints)
+    joint, other_side = np.arange(joints), np.array(COCO17_FLIP)
+    paired = (other_side != joint)[:, None]
     # Passes of assignment; few joints change after the second.
     for _ in range(4):
         before = taken.copy()
         for person in order[near[order].any(axis=1)]:
             rivals = np.flatnonzero(near[person])
-            rival_joints = np.take_along_axis(
-                places[rivals], taken[rivals][..., None, None], axis=2
-            )
-            rival_mass = np.take_along_axis(mass[rivals], taken[rivals][..., None], axis=2)
+            chosen = rivals[:, None], joint, taken[rivals]
+            at, sure = places[chosen][:, :, None], mass[chosen][:, :, None]
             # Standard deviation of the distance between two estimates of one joint, as a share of
             # the longer side of the smaller box [1].
             spread = 0.03 * np.minimum(longer[rivals], longer[person])[:, None, None]
-            rival = _rivalry(places[person], rival_joints, rival_mass, spread)
-            rival += paired[:, None] * _rivalry(
-                places[person], rival_joints[:, other_side], rival_mass[:, other_side], spread
-            )
+            rival = _rivalry(places[person], at, sure, spread)
+            other = _rivalry(places[person], at[:, other_side], sure[:, other_side], spread)
+            rival += paired * other
             # Cost of a candidate that certainly is another person's joint [nats].
             taken[person] = np.argmin(price[person] + 2.0 * rival, axis=1)
         if np.array_equal(before, taken):
@@ -236,7 +228,7 @@ def assign_joints(places: Floats, mass: Floats, boxes: Floats) -> NDArray[np.int
 
 def _rivalry(places: Floats, at: Floats, sure: Floats, spread: Floats) -> Floats:
     """Return the overlap (17, count) [1] of candidates with joints `at` (neighbours, 17, 1, 2)."""
-    apart = np.square(places - at).sum(axis=-1)
+    apart = np.square(places[..., 0] - at[..., 0]) + np.square(places[..., 1] - at[..., 1])
     return np.asarray((sure * np.exp(-0.5 * apart / spread**2)).sum(axis=0))
 
 

@@ -73,9 +73,11 @@ class Part:
 
     def merge(self, earlier: People, seen: People) -> People:
         """Return earlier people of the frame and those found in `crop`, without those replaced."""
-        tall = earlier.boxes[:, 3] - earlier.boxes[:, 1]
-        kept = ~self._holds(earlier.boxes) | (tall < self.replaced[0]) | (tall >= self.replaced[1])
-        return People.concatenate([earlier.select(kept), self.to_frame(seen)])
+        low, high = self.replaced
+        if low < high:
+            tall = earlier.boxes[:, 3] - earlier.boxes[:, 1]
+            earlier = earlier.select(~self._holds(earlier.boxes) | (tall < low) | (tall >= high))
+        return People.concatenate([earlier, self.to_frame(seen)])
 
     def _holds(self, boxes: Floats) -> Flags:
         """Return whether the centres of boxes lie in `inner` (people,)."""

@@ -10,9 +10,11 @@ from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn.functional import pad
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from worldpose.detection.bundled_nets import Block, normalize
@@ -24,6 +26,7 @@ Asked = TypeVar("Asked")
 Seen = TypeVar("Seen")
 Result = TypeVar("Result")
 Tensors = tuple[Tensor, ...]
+Given = NDArray[Any] | Tensor
 Decode = Callable[[Tensors], Tensors]
 """Returns what is needed of a net's outputs."""
 
@@ -77,15 +80,15 @@ class PlacedNet:
                 if isinstance(module, nn.Conv2d):
                     module.to(self._kind)
 
-    def __call__(self, *given: Tensor) -> Tensors:
+    def __call__(self, *given: Given) -> Tensors:
         """Return the outputs, on the device, for one image or more.
 
         Args:
-            given: images (batch, 3, height, width) of bytes, and what else the net takes.
+            given: images (batch, height, width, 3) of bytes, and what else the net takes.
         """
         found, start = list[Tensors](), 0
         while start < len(given[0]):
-            part = [each[start : start + self.batch].to(self.device) for each in given]
+            part = [each[start : start + self.batch] for each in given]
             try:
                 with torch.inference_mode():
                     outputs = self._compute(part)
@@ -106,22 +109,19 @@ class PlacedNet:
             return found[0]
         return tuple(torch.cat(each) for each in zip(*found, strict=True))
 
-    def _compute(self, given: Sequence[Tensor]) -> Tensors:
+    def _compute(self, given: Sequence[Given]) -> Tensors:
         if isinstance(self._net, QuantizedNet):
             return self._net(*given)
         count = len(given[0])
-        images, *maps = (_fill(each, -count % min(self._fill, self.batch)) for each in given)
-        images = normalize(images.permute(0, 2, 3, 1).contiguous())
+        placed = (torch.as_tensor(each, device=self.device) for each in given)
+        missing = -count % min(self._fill, self.batch)
+        images, *maps = (pad(each, [0, 0] * (each.ndim - 1) + [0, missing]) for each in placed)
+        images = normalize(images)
         outputs: Tensors = self._net(*(each.to(self._kind) for each in (images, *maps)))
         if count == len(images):
             return outputs
         # Parameters of the net, among the outputs, have no row per image.
         return tuple(each[:count] if len(each) == len(images) else each for each in outputs)
-
-
-def _fill(given: Tensor, missing: int) -> Tensor:
-    """Return the given rows and some further ones of zeros."""
-    return torch.cat([given, given.new_zeros(missing, *given.shape[1:])]) if missing else given
 
 
 def run_together(
@@ -167,10 +167,10 @@ class QuantizedNet:
         self._names = [each.name for each in self._session.get_inputs()]
         self.weights_sha256 = self._session.get_modelmeta().custom_metadata_map[WEIGHTS_DIGEST]
 
-    def __call__(self, *given: Tensor) -> Tensors:
-        """Return the outputs for images (batch, 3, height, width) of bytes, and maps."""
-        named = zip(self._names, (each.numpy() for each in given), strict=True)
-        found: list[NDArray[Any]] = self._session.run(None, dict(named))
+    def __call__(self, *given: Given) -> Tensors:
+        """Return the outputs for images (batch, height, width, 3) of bytes, and maps."""
+        named = dict(zip(self._names, map(np.asarray, given), strict=True))
+        found: list[NDArray[Any]] = self._session.run(None, named)
         return tuple(torch.from_numpy(each) for each in found)
 
 

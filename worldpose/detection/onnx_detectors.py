@@ -247,11 +247,7 @@ class _OnnxDetector:
 
     def __init__(self, net: OnnxNet, form: Form, people: tuple[int, ...]) -> None:
         self._net, self._form, self._people = net, form, people
-
-    @property
-    def view_size(self) -> tuple[int, int]:
-        """Input size of the net."""
-        return self._net.size
+        self.view_size = net.size
 
     def detect(self, images: Sequence[Image]) -> list[People]:
         """Return the people in each view."""

@@ -392,12 +392,12 @@ class PeopleFinder:
 
     def _chunk(self, numbers: list[int], rows: list[KeypointDetections]) -> KeypointDetections:
         """Return the detections of frames in one record, padded with NaN."""
-        arrays = {}
-        for name, like in rows[0].arrays().items():
+        arrays, each = {}, [found.arrays() for found in rows]
+        for name, like in each[0].items():
             shape = (len(rows), self._most, *like.shape[1:])
             arrays[name] = np.full(shape, np.nan, dtype=np.float32)
-            for row, found in zip(arrays[name], rows, strict=True):
-                row[: len(found.score)] = found.arrays()[name]
+            for row, found in zip(arrays[name], each, strict=True):
+                row[: len(found[name])] = found[name]
         self.report.detections += sum(len(found.score) for found in rows)
         self.report.frames += len(rows)
         return rows[0].with_arrays(arrays, np.array(numbers, dtype=np.int64))

@@ -20,7 +20,7 @@ from numpy.typing import DTypeLike, NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from data_contracts.arrays import Floats, Image
+from data_contracts.arrays import Floats, Image, Singles
 from worldpose.detection.crops import (
     CROP,
     OUTSIDE,
@@ -89,8 +89,8 @@ def resize(view: View, into: Image | None = None) -> Frame:
     return np.asarray(cv2.resize(image, shape[::-1], into, interpolation=method), dtype=np.uint8)
 
 
-def pad(views: Sequence[View], shape: Sequence[int]) -> Tensor:
-    """Return the planes of views (n, 3, height, width), grey to the right of and below each.
+def pad(views: Sequence[View], shape: Sequence[int]) -> Frame:
+    """Return views (n, height, width, 3), grey to the right of and below each.
 
     On a CPU the thread's next call overwrites them.
 
@@ -98,21 +98,15 @@ def pad(views: Sequence[View], shape: Sequence[int]) -> Tensor:
         views: smaller ones of any size.
         shape: height, width [px].
     """
-    whole = (len(views), 3, *shape)
-    if isinstance(first := views[0][0], Tensor):
-        padded = first.new_full(whole, OUTSIDE)
-        for canvas, view in zip(padded, views, strict=True):
-            seen = torch.as_tensor(resize(view))
-            canvas[:, : seen.shape[0], : seen.shape[1]] = seen.permute(2, 0, 1)
-        return padded
-    batch = borrow("planes", whole)
-    for planes, view in zip(batch, views, strict=True):
+    whole, first = (len(views), *shape, 3), views[0][0]
+    batch = first.new_empty(whole) if isinstance(first, Tensor) else borrow("views", whole)
+    for canvas, view in zip(batch, views, strict=True):
         height, width = resized_shape(view)
-        planes[:, height:], planes[:, :height, width:] = OUTSIDE, OUTSIDE
-        image = np.asarray(resize(view, borrow("view", (height, width, 3))))
-        # Far faster than a transposition.
-        cv2.split(image, list(planes[:, :height, :width]))
-    return torch.from_numpy(batch)
+        canvas[height:], canvas[:height, width:] = OUTSIDE, OUTSIDE
+        inside = canvas[:height, :width]
+        if (seen := resize(view, inside)) is not inside:
+            inside[:] = seen
+    return batch
 
 
 def sample_crops(
@@ -120,7 +114,7 @@ def sample_crops(
     boxes: Sequence[Floats],
     others: Sequence[Floats],
     device: str,
-) -> tuple[Floats, Tensor, Tensor]:
+) -> tuple[Floats, Frame, Singles]:
     """Return a crop around each box of some frames, and maps of the boxes around it.
 
     Args:
@@ -130,23 +124,22 @@ def sample_crops(
         device: `cpu` or `cuda`.
 
     Returns:
-        Maps from pixels of the crops to those of the frames (crops, 2, 3), planes (crops, 3,
-        height, width) of bytes, which the thread's next call overwrites on a CPU, and maps (crops,
-        3, rows, columns).
+        Maps from pixels of the crops to those of the frames (crops, 2, 3), crops (crops, height,
+        width, 3) of bytes, which the thread's next call overwrites on a CPU, and maps (crops, 3,
+        rows, columns).
     """
     flat = np.concatenate(boxes)
     mappings = frame_from_crop(crops_around(flat), CROP)
     ends = np.cumsum([0, *map(len, boxes)])
-    frames = place_frames(images, device)
+    shared = zip(place_frames(images, device), pairwise(ends.tolist()), strict=True)
     if device != "cpu":
-        each = [_sample(f, mappings[a:b]) for f, (a, b) in zip(frames, pairwise(ends), strict=True)]
-        crops = torch.cat(each)
+        crops: Frame = torch.cat([_sample(frame, mappings[a:b]) for frame, (a, b) in shared])
     else:
-        crops = torch.from_numpy(borrow("crops", (len(flat), 3, CROP[1], CROP[0])))
-        of = np.repeat(np.arange(len(boxes)), np.diff(ends))
-        for planes, at, mapping in zip(crops.numpy(), of, mappings, strict=True):
-            cv2.split(cut_crop(images[int(at)], mapping, CROP), list(planes))
-    return mappings, crops, torch.from_numpy(surroundings(flat, others, mappings, CROP))
+        crops = borrow("crops", (len(flat), CROP[1], CROP[0], 3))
+        for image, (a, b) in shared:
+            for number in range(a, b):
+                crops[number] = cut_crop(np.asarray(image), mappings[number], CROP)
+    return mappings, crops, surroundings(flat, others, mappings, CROP)
 
 
 def _sample(frame: Frame, mappings: Floats) -> Tensor:
@@ -167,4 +160,4 @@ def _sample(frame: Frame, mappings: Floats) -> Tensor:
         seen = functional.grid_sample(planes, grid, align_corners=False)
         mean = functional.avg_pool2d(seen.view(3, *x.shape).transpose(0, 1), int(count))
         crops[torch.from_numpy(rows).to(image.device)] = (mean + OUTSIDE).round().to(torch.uint8)
-    return crops
+    return crops.permute(0, 2, 3, 1).contiguous()

@@ -105,7 +105,8 @@ def object_keypoint_similarity(keypoints: AnyFloats, area: AnyFloats) -> Floats:
         keypoints: (people, 17, 2) [px]; NaN where not found.
         area: (people,) area of their boxes [px^2]; the smaller of a pair counts.
     """
-    apart = np.square(keypoints[:, None] - keypoints[None]).sum(axis=3)
+    x, y = np.moveaxis(keypoints, -1, 0)
+    apart = np.square(x[:, None] - x) + np.square(y[:, None] - y)
     scale = 2.0 * np.minimum(area[:, None], area[None])[..., None]
     alike = np.exp(-apart / (scale * (2.0 * np.array(COCO17_SIGMAS)) ** 2))
     both = np.isfinite(apart)
@@ -132,11 +133,11 @@ def suppress_poses(
         found &= np.isfinite(detections.keypoints).all(axis=2)
     detections = detections.without(~found)
     alike = object_keypoint_similarity(detections.keypoints, box_areas(detections.boxes))
-    kept = np.zeros(len(detections.score), dtype=np.bool_)
+    kept, shown = np.zeros(len(detections.score), dtype=np.bool_), np.asarray(found.any(axis=1))
     score = detections.score.copy()
     for row in np.argsort(-detections.score, kind="stable"):
         most = alike[row, kept].max(initial=0.0)
-        kept[row] = found[row].any() and most <= same_pose
+        kept[row] = shown[row] and most <= same_pose
         # Share of its score that a box with the pose of a better box loses [1].
         score[row] *= 1.0 - 0.5 * most**2
     return replace(detections, score=score).select(kept)

@@ -52,12 +52,8 @@ class TransformersDetector:
         asked = None if select_named_people(names) else person_classes
         self._people = find_person_classes(str(folder), count, names, asked)
         size = self._processor.size
-        self._size = (int(size.get("width", 640)), int(size.get("height", 640)))
-
-    @property
-    def view_size(self) -> tuple[int, int]:
-        """Size to which the processor scales images."""
-        return self._size
+        # To which the processor scales images.
+        self.view_size = (int(size.get("width", 640)), int(size.get("height", 640)))
 
     def detect(self, images: Sequence[Image]) -> list[People]:
         """Return the people in each image."""

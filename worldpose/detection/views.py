@@ -39,6 +39,8 @@ class ImageTile:
 class TiledDetector:
     """A detector that splits frames of any size into views."""
 
+    view_size = None
+
     def __init__(
         self, detector: Detector, zooms: Sequence[float], view_overlap: float, overlap: float
     ) -> None:
@@ -53,11 +55,6 @@ class TiledDetector:
         assert detector.view_size is not None  # others take frames whole
         self._detector, self._size = detector, detector.view_size
         self._zooms, self._view_overlap, self._overlap = tuple(zooms), view_overlap, overlap
-
-    @property
-    def view_size(self) -> None:
-        """None: frames of any size."""
-        return
 
     def detect(self, images: Sequence[Image]) -> list[People]:
         """Return the people in each frame, from views that do not cut them."""

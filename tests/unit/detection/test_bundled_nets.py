@@ -14,6 +14,7 @@ from worldpose.detection.bundled_nets import (
     FORMAT,
     KeypointNet,
     PeopleNet,
+    decode_boxes,
     decode_candidates,
     load_weights,
     save_weights,
@@ -74,14 +75,40 @@ def test_people_and_poses_do_not_depend_on_the_batch():
     assert inside.all()
 
 
-def test_joints_are_the_peaks_that_a_search_over_all_cells_finds():
+class Elsewhere(torch.Tensor):
+    """A tensor that is decoded as on a GPU, by torch alone."""
+
+    is_cpu = False
+
+
+def test_torch_alone_finds_the_boxes_of_the_kernel():
+    rng = np.random.default_rng(6)
+    given = []
+    for shape in ((2, 9, 14), (1, 5, 3)):
+        logits, sides = rng.normal(0.0, 3.0, shape), rng.uniform(1.0, 40.0, (4, *shape))
+        given.append([torch.from_numpy(each).float() for each in (logits, sides.swapaxes(0, 1))])
+    kernel, alone = (
+        decode_boxes([[one.as_subclass(kind) for one in each] for each in given], 0.3).numpy()
+        for kind in (torch.Tensor, Elsewhere)
+    )
+    assert set(kernel[:, 0]) == {0.0, 1.0, 2.0} and len(kernel) > 15
+    np.testing.assert_allclose(kernel, alone, rtol=1e-12)
+    best = given[0][0][1].argmax().item()  # of the second image
+    (row,) = kernel[(kernel[:, 0] == 1.0) & (kernel[:, 5] == kernel[kernel[:, 0] == 1.0, 5].max())]
+    left, top, right, bottom = given[0][1][1].flatten(1)[:, best].tolist()
+    x, y = (4.0 * at + 1.5 for at in (best % 14, best // 14))
+    np.testing.assert_allclose(row[1:5], [x - left, y - top, x + right, y + bottom], rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", [torch.Tensor, Elsewhere])
+def test_joints_are_the_peaks_that_a_search_over_all_cells_finds(kind):
     rng = np.random.default_rng(4)
     y, x = np.mgrid[:32, :24]
     at = rng.uniform([0, 0], [32, 24], (2, 17, 3, 2))[..., None, None]
     heights = rng.uniform(4.0, 9.0, (2, 17, 3, 1, 1))
     waves = heights * np.exp(-((y - at[..., 0, :, :]) ** 2 + (x - at[..., 1, :, :]) ** 2) / 8.0)
     maps = torch.from_numpy(waves.sum(axis=2) + rng.normal(0.0, 0.1, (2, 17, 32, 24))).float()
-    places, mass = (each.numpy() for each in decode_candidates(maps, 4))
+    places, mass = (each.numpy() for each in decode_candidates(maps.as_subclass(kind), 4))
     chance = torch.softmax(maps.flatten(2), dim=-1).view_as(maps).numpy()
     wide = np.pad(chance, ((0, 0), (0, 0), (3, 3), (3, 3)))
     peak = chance == sliding_window_view(wide, (7, 7), axis=(2, 3)).max(axis=(4, 5))

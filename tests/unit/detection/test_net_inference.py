@@ -37,9 +37,9 @@ on_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 @pytest.fixture(scope="module")
 def crops():
     rng = np.random.default_rng(3)
-    images = rng.integers(0, 256, (3 * CROPS, 3, CROP[1], CROP[0]), dtype=np.uint8)
+    images = rng.integers(0, 256, (3 * CROPS, CROP[1], CROP[0], 3), dtype=np.uint8)
     maps = rng.random((3 * CROPS, 3, 32, 24)).astype(np.float32)
-    return torch.from_numpy(images), torch.from_numpy(maps)
+    return images, maps
 
 
 @pytest.fixture(scope="module")
