@@ -55,7 +55,7 @@ def evaluate(
         match_in: Match whole tracks by their boxes in this camera of the reference, as the
             paper does; by distance by default.
         fps: Frames per second; the match's by default.
-        ablation: Simulate N penalty-box trials and print the paper's ablation instead, by our
+        ablation: Simulate N trials of each kind and print the paper's ablation instead, by our
             method and by the paper's own (worldpose/reference_method; needs torch).
         method: Score another method's result (docs/how-to/baselines.md) instead of
             --prediction; may be given more than once for one table.
@@ -251,7 +251,7 @@ def print_ablation(seeds: int) -> None:
 
     Seeds count from 0; JSON has every trial's metrics.
     """
-    from flows.results.ablation import BY_PAPER, PAPER, TRIANGULATIONS, Score, ablation
+    from flows.results.ablation import BY_PAPER, PAPER, Score, ablation
 
     trials = ablation(
         range(seeds), lambda clicks, seed: line(f"{clicks}: trial {seed} done", to=errors)
@@ -268,21 +268,14 @@ def print_ablation(seeds: int) -> None:
     )
     columns = ("", ">G-MPJPE", ">PA-MPJPE", ">ground m", ">clicks px")
     for clicks, found in trials.items():
-        for how in (*TRIANGULATIONS, BY_PAPER):
-            names = [row.removesuffix(how) for row in found[0] if _is_of(row, how)]
-            rows = [_row(name, [t[name + how] for t in found]) for name in names]
-            if rows:
-                print_table(f"{clicks}{how}: {seeds} trials, mm, mean ± spread", columns, rows)
+        for how in ("", BY_PAPER):
+            names = [row for row in found[0] if row.endswith(BY_PAPER) == bool(how)]
+            rows = [
+                _row(each.removesuffix(how), [trial[each] for trial in found]) for each in names
+            ]
+            print_table(f"{clicks}{how}: {seeds} trials, mm, mean ± spread", columns, rows)
     published = [(name, f"{g:.1f}", f"{pa:.1f}") for name, (g, pa) in PAPER.items()]
     print_table("the paper's trial, real people, mm", ("", ">G-MPJPE", ">PA-MPJPE"), published)
-
-
-def _is_of(row: str, how: str) -> bool:
-    """Return whether an ablation's row ends with this way; our own has no suffix."""
-    from flows.results.ablation import BY_PAPER, TRIANGULATIONS
-
-    ends = (end for end in (*TRIANGULATIONS, BY_PAPER) if row.endswith(end))
-    return max(ends, key=len) == how
 
 
 def _row(name: str, scores: list[Score]) -> str:
