@@ -23,6 +23,7 @@ from data_contracts.records import (
     Share,
 )
 from data_contracts.run import StoredFile
+from data_contracts.triangulation import CameraChange
 from data_contracts.usability import Usability
 
 EXPORT_PURPOSES: Final[Mapping[str, str]] = {
@@ -211,6 +212,19 @@ Split = Literal["train", "val", "test"]
 """Part of a data set; a match is in one."""
 
 
+class RigCamera(Record):
+    """A static camera in one clip of a data set."""
+
+    image_size: tuple[ImageLength, ImageLength]
+    """Width and height [px]."""
+    visible: Share | None
+    """Mean share of a person's joints that it shows [1]; None without people."""
+    lens: dict[str, str | Number | None] | None = None
+    """Model of another lens than Brown's, and the largest errors of the five coefficients [px]."""
+    changes: tuple[CameraChange, ...] = ()
+    """How the view changes within the clip; the camera's file is from before."""
+
+
 class ReleasedSequence(Record):
     """One clip of a data set of several matches."""
 
@@ -232,6 +246,8 @@ class ReleasedSequence(Record):
     """The person of each row of poses, joints and boxes: the same name is the same person."""
     views: dict[str, tuple[ImageLength, ImageLength]]
     """Width and height [px] of each broadcast camera's images, by the name of its files."""
+    rig: dict[Name, RigCamera]
+    """Static cameras."""
     footage: dict[str, StoredFile]
     """Video by the same names: the copy, or the file in the match folder."""
     first_images: dict[str, Frame]

@@ -177,7 +177,7 @@ def _known_shapes(
     named: dict[str, dict[str, str]] = dict(inputs.sources["people"])
     here, own = named.pop(inputs.unit), _fitted_shapes(fitted)
     others = {clip: _fitted_shapes(inputs.open(f"body_fitting/{clip}")) for clip in named}
-    model, weight = find_same_body(before), before.settings(BodyFittingSettings).shape_weight
+    model, weight = find_same_body(before), before.settings(BodyFittingSettings).prior_weight
 
     def stature(shape: Shape) -> str:
         height = model.template[:, 1] + model.shape_directions[:, 1] @ shape.betas
@@ -202,7 +202,7 @@ def _known_shapes(
                         "other's shape: correct `people` in match.yaml."
                     )
         if shapes:
-            known[ids.index(int(person))] = pool_shapes(shapes, weight)
+            known[ids.index(int(person))] = pool_shapes(shapes, [weight] * len(shapes))
     return known
 
 

@@ -54,7 +54,7 @@ def evaluate(
         match_in: Match whole tracks by their boxes in this camera of the reference, as the
             paper does; by distance by default.
         fps: Frames per second; the match's by default.
-        ablation: Simulate N penalty-box trials and print the paper's ablation instead, by our
+        ablation: Simulate N trials of each kind and print the paper's ablation instead, by our
             method and by the paper's own (worldpose/reference_method; needs torch).
         method: Score another method's result (docs/how-to/baselines.md) instead of
             --prediction; may be given more than once for one table.
@@ -250,7 +250,7 @@ def print_ablation(seeds: int) -> None:
 
     Seeds count from 0; JSON has every trial's metrics.
     """
-    from flows.results.ablation import BY_PAPER, PAPER, TRIANGULATIONS, Score, ablation
+    from flows.results.ablation import BY_PAPER, PAPER, Score, ablation
 
     trials = ablation(
         range(seeds), lambda clicks, seed: line(f"{clicks}: trial {seed} done", to=errors)
@@ -266,25 +266,26 @@ def print_ablation(seeds: int) -> None:
         }
     )
     columns = ("", ">G-MPJPE", ">PA-MPJPE", ">ground m", ">clicks px")
-    figures = ("g_mpjpe_mm", "pa_mpjpe_mm", "ground_error_m", "marking_error_px")
-    hows = sorted((*TRIANGULATIONS, BY_PAPER), key=len, reverse=True)
     for clicks, found in trials.items():
-        # The longest of these that ends a row's name; our own has no suffix.
-        rows = {how: list[str]() for how in (*TRIANGULATIONS, BY_PAPER)}
-        for row in found[0]:
-            how = next(each for each in hows if row.endswith(each))
-            g, pa, ground, marking = (
-                np.array([getattr(trial[row], figure) for trial in found]) for figure in figures
-            )
-            rows[how].append(
-                f"{row.removesuffix(how)}\t{g.mean():.1f} ± {g.std():.1f}\t"
-                f"{pa.mean():.1f} ± {pa.std():.1f}\t{ground.mean():.3f}\t{marking.mean():.2f}"
-            )
-        for how, shown in rows.items():
-            if shown:
-                print_table(f"{clicks}{how}: {seeds} trials, mm, mean ± spread", columns, shown)
+        for how in ("", BY_PAPER):
+            names = [row for row in found[0] if row.endswith(BY_PAPER) == bool(how)]
+            rows = [
+                _row(each.removesuffix(how), [trial[each] for trial in found]) for each in names
+            ]
+            print_table(f"{clicks}{how}: {seeds} trials, mm, mean ± spread", columns, rows)
     published = [(name, f"{g:.1f}", f"{pa:.1f}") for name, (g, pa) in PAPER.items()]
     print_table("the paper's trial, real people, mm", ("", ">G-MPJPE", ">PA-MPJPE"), published)
+
+
+def _row(name: str, scores: list[Score]) -> str:
+    g, pa, ground, marking = (
+        np.array([getattr(score, figure) for score in scores])
+        for figure in ("g_mpjpe_mm", "pa_mpjpe_mm", "ground_error_m", "marking_error_px")
+    )
+    return (
+        f"{name}\t{g.mean():.1f} ± {g.std():.1f}\t{pa.mean():.1f} ± {pa.std():.1f}\t"
+        f"{ground.mean():.3f}\t{marking.mean():.2f}"
+    )
 
 
 def named_rates(given: Sequence[str]) -> dict[str, float]:

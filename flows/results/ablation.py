@@ -1,16 +1,17 @@
-"""The paper's ablation of bundle adjustment, on simulated trials with known truth."""
+"""The paper's ablation of bundle adjustment, on trials of two simulators with known truth."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from data_contracts.arrays import Floats
+from data_contracts.keypoints import KeypointDetections
+from data_contracts.pitch import PitchSpec
+from data_contracts.static_calibration import ClickedMarkings
 from worldpose.body.body_file import find_body
 from worldpose.body_fitting.estimate import fit_bodies
 from worldpose.body_fitting.results import BodyFit, ClipEvidence
@@ -26,8 +27,10 @@ from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.reference_method import require_torch
+from worldpose.simulation.foreign.matches import simulate_foreign_scene
+from worldpose.simulation.foreign.scenarios import FOREIGN_SCENARIOS
 from worldpose.simulation.scenarios import SCENARIOS
-from worldpose.simulation.scene import Scene, simulate_scene
+from worldpose.simulation.scene import simulate_scene
 from worldpose.simulation.settings import ClickSettings
 from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.report import StaticCalibration
@@ -38,15 +41,15 @@ from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.results import Triangulation
 from worldpose.triangulation.settings import TriangulationSettings
 
-SCENARIO: Final = "penalty-box"
-CLICKS: Final = {
+CLICKS: Final[Mapping[str, ClickSettings | None]] = {
     "few clicks": ClickSettings(
         clustered=1.0, window=0.35, clustered_points=(5, 6), noise_px=1.5, wrong=0.0
     ),
     "many clicks": ClickSettings(),
+    "second world": None,
 }
 """Five or six clicks in a third of the image with 1.5 px noise; eight to twelve all over it with
-1 px noise, some of them wrong."""
+1 px noise, some of them wrong; the second simulator's own, eight to seventeen."""
 
 PAPER: Final = {
     "base": (83.5, 70.8),
@@ -60,14 +63,6 @@ BY_PAPER: Final = ", the paper's method"
 """End of the names of rows that `worldpose.reference_method` computes."""
 
 _OURS: Final = TriangulationSettings()
-_STATED: Final = {"offsets": "none", "learn_noise": False}
-TRIANGULATIONS: Final = {
-    "": _OURS,
-    ", stated noise": _OURS.model_copy(update=_STATED),
-    ", plain least squares": _OURS.model_copy(update=_STATED | {"max_deviation": 1e6}),
-}
-"""Our settings; then robust triangulation with the stated noise and no camera errors; then plain
-least squares without outlier rejection."""
 
 
 @dataclass(frozen=True)
@@ -89,8 +84,42 @@ class Score:
     changed: float
 
 
-def trial(seed: int, clicks: ClickSettings) -> dict[str, Score]:
-    """Return the rows of one simulated trial by name.
+class Trial(NamedTuple):
+    """A simulated trial: its truth, and what a user has of it, by camera."""
+
+    fps: float
+    truth: JointTracks
+    cameras: Mapping[str, Camera]
+    clicked: Mapping[str, ClickedMarkings]
+    observations: Mapping[str, KeypointDetections]
+    painted: PitchSpec
+    surveyed: PitchSpec
+
+
+def simulate(seed: int, clicks: ClickSettings | None) -> Trial:
+    """Return a trial like the paper's, of 2 s, 6 players close together and 10 cameras.
+
+    Without clicks it is of the second simulator, with synchronised cameras that are to be clicked.
+    """
+    if clicks is not None:
+        scenario = SCENARIOS["penalty-box"].model_copy(update={"clicks": clicks})
+        own = simulate_scene(scenario, seed)
+        clicked = {name: each.markings for name, each in own.clicks.items()}
+        seen = {name: own.observations[name] for name in own.cameras}
+        pitches = scenario.pitch, own.surveyed
+        return Trial(scenario.fps, own.truth, own.cameras, clicked, seen, *pitches)
+    close = {"given": 0.0, "unsynchronised": 0.0, "area": (0.08, 0.13)}
+    kind = FOREIGN_SCENARIOS["foreign-match"].model_copy(update=close)
+    scene = simulate_foreign_scene(kind, seed, duration=2.0, cameras=10, people=6)
+    assert scene.pitch is not None
+    cameras = {name: each.camera for name, each in scene.cameras.items()}
+    seen = {name: each.observations for name, each in scene.reports.items()}
+    pitches = scene.pitch.painted, scene.pitch.stated
+    return Trial(scene.fps, scene.truth, cameras, scene.clicked, seen, *pitches)
+
+
+def trial(seed: int, clicks: ClickSettings | None) -> dict[str, Score]:
+    """Return the rows of one simulated trial by name; without clicks, of the second simulator.
 
     Base is calibration from clicks alone, without painted lines, as in the paper. `S only` frees
     the whole lens and drops the camera priors, as is common practice; the rows `unguarded` show its
@@ -101,8 +130,7 @@ def trial(seed: int, clicks: ClickSettings) -> dict[str, Score]:
     Note:
         Paper, table of the Vicon trial.
     """
-    scenario = SCENARIOS[SCENARIO].model_copy(update={"clicks": clicks})
-    scene = simulate_scene(scenario, seed)
+    scene = simulate(seed, clicks)
     pitch = PitchTemplate.from_spec(scene.surveyed)
     calibrations = _calibrate_cameras(scene, pitch)
     clip = _clip(scene, calibrations, pitch)
@@ -117,17 +145,16 @@ def trial(seed: int, clicks: ClickSettings) -> dict[str, Score]:
         "+ BA, S only": (markings.cameras, markings.accepted),
         "+ BA, S, unguarded": (markings.refused, everyone),
     }
-    score = partial(_score, scene, clip, tuple(calibrations))
-    scores = {
-        name + how: score(
-            cameras, changed, triangulate_joints(cameras, clip.detections, settings).joints
-        )
-        for how, settings in TRIANGULATIONS.items()
-        for name, (cameras, changed) in rows.items()
-    }
+    names = tuple(calibrations)
+    scores = {}
+    for name, (cameras, changed) in rows.items():
+        joints = triangulate_joints(cameras, clip.detections, _OURS).joints
+        scores[name] = _score(scene, clip, names, cameras, changed, joints)
     placed = triangulate_joints(both.cameras, clip.detections, _OURS, both.covariance)
-    scores["+ BA + SMPL"] = score(both.cameras, both.accepted, _fit(scene, clip, placed))
-    return scores | _by_paper(score, clip, calibrations, pitch)
+    scores["+ BA + SMPL"] = _score(
+        scene, clip, names, both.cameras, both.accepted, _fit(scene, clip, placed)
+    )
+    return scores | _by_paper(scene, clip, calibrations, pitch)
 
 
 def ablation(
@@ -142,32 +169,37 @@ def ablation(
     return trials
 
 
-def _calibrate_cameras(scene: Scene, pitch: PitchTemplate) -> dict[str, StaticCalibration]:
+def _calibrate_cameras(scene: Trial, pitch: PitchTemplate) -> dict[str, StaticCalibration]:
     """Calibrate the cameras whose clicks determine them; skip the others."""
-    found, settings = {}, StaticCalibrationSettings(lines=False)
+    found = {}
     for name, camera in scene.cameras.items():
         size = (int(camera.image_size[0]), int(camera.image_size[1]))
-        clicks = scene.clicks[name].markings
-        with suppress(InputError):
-            found[name] = calibrate_camera(pitch, clicks, size, settings=settings, where=name)
+        settings = StaticCalibrationSettings(lines=False)
+        try:
+            found[name] = calibrate_camera(
+                pitch, scene.clicked[name], size, settings=settings, where=name
+            )
+        except InputError:
+            continue
     return found
 
 
 def _clip(
-    scene: Scene, calibrations: Mapping[str, StaticCalibration], pitch: PitchTemplate
+    scene: Trial, calibrations: Mapping[str, StaticCalibration], pitch: PitchTemplate
 ) -> Clip:
     """Track and triangulate the trial with the base cameras; return bundle adjustment's input."""
-    seen = scene.static_views(list(calibrations))
+    seen = KeypointDetections.stack([scene.observations[name] for name in calibrations])
+    points, sure = seen.keypoints.astype(np.float64), seen.confidence.astype(np.float64)
+    seen = KeypointDetections.from_keypoints(points, sure, frame=seen.frame)
     cameras = Camera.stack([known.estimate.camera for known in calibrations.values()])
-    fps = SCENARIOS[SCENARIO].fps
-    tracks = track_people(cameras, seen.detections, fps, TrackingSettings())
-    detections = seen.detections.assign_people(tracks.detection_index)
+    tracks = track_people(cameras, seen, scene.fps, TrackingSettings())
+    detections = seen.assign_people(tracks.detection_index)
     placed = triangulate_joints(cameras, detections, _OURS)
     return Clip(
         cameras=cameras,
         covariance=np.stack([known.estimate.covariance for known in calibrations.values()]),
         clicks=tuple(Clicks.of(known, pitch) for known in calibrations.values()),
-        fps=fps,
+        fps=scene.fps,
         detections=detections,
         joints=placed.joints,
         views=placed.views.astype(np.int64),
@@ -176,10 +208,7 @@ def _clip(
 
 
 def _by_paper(
-    score: Callable[[Camera, np.ndarray, Floats], Score],
-    clip: Clip,
-    known: Mapping[str, StaticCalibration],
-    pitch: PitchTemplate,
+    scene: Trial, clip: Clip, known: Mapping[str, StaticCalibration], pitch: PitchTemplate
 ) -> dict[str, Score]:
     """Return the paper's four rows by its own method, from the same tracks.
 
@@ -210,9 +239,11 @@ def _by_paper(
     for name, (cameras, changed) in rows.items():
         start = triangulate_joints(cameras, clip.detections, _OURS).joints
         joints[name] = place_joints(cameras, clip.detections, start, about_mid_hip=False)
-        scores[name + BY_PAPER] = score(cameras, changed, joints[name])
+        scores[name + BY_PAPER] = _score(scene, clip, tuple(known), cameras, changed, joints[name])
     bodies = _fit_as_paper(clip, both.cameras, joints["+ BA, S and P"])
-    scores["+ BA + SMPL" + BY_PAPER] = score(both.cameras, both.accepted, bodies)
+    scores["+ BA + SMPL" + BY_PAPER] = _score(
+        scene, clip, tuple(known), both.cameras, both.accepted, bodies
+    )
     return scores
 
 
@@ -227,7 +258,7 @@ def _fit_as_paper(clip: Clip, cameras: Camera, joints: Floats) -> Floats:
     return BodyFit.concatenate([fit for _, fit in parts]).joints
 
 
-def _fit(scene: Scene, clip: Clip, placed: Triangulation) -> Floats:
+def _fit(scene: Trial, clip: Clip, placed: Triangulation) -> Floats:
     """Return the joints of our bodies."""
     how = BodyFittingSettings()
     floor = PitchTemplate.from_spec(scene.surveyed).height
@@ -236,7 +267,7 @@ def _fit(scene: Scene, clip: Clip, placed: Triangulation) -> Floats:
 
 
 def _score(
-    scene: Scene,
+    scene: Trial,
     clip: Clip,
     names: tuple[str, ...],
     cameras: Camera,
@@ -247,7 +278,7 @@ def _score(
     tracks = JointTracks(clip.detections.frame, np.arange(joints.shape[1]), joints)
     found, _ = evaluate_joints(tracks, scene.truth, fps=clip.fps)
     estimated = {name: cameras[c] for c, name in enumerate(names)}
-    pitch = PitchTemplate.from_spec(SCENARIOS[SCENARIO].pitch)
+    pitch = PitchTemplate.from_spec(scene.painted)
     errors, _ = evaluate_cameras(estimated, scene.cameras, pitch)
     ground = None if errors is None or errors.static is None else errors.static
     return Score(

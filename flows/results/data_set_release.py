@@ -6,8 +6,9 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import fields, replace
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
 from typing import Final, Literal
 
@@ -21,18 +22,24 @@ from flows.results import best_results
 from flows.results.best_results import Origin
 from flows.results.dataset import check, count
 from flows.results.export import keep_run
+from flows.results.run_cameras import view_changes, with_brown_lenses
 from flows.results.tool_exports import filmed_cameras
 from worldpose.body.body_file import find_body
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BodyModel
 from worldpose.body.occlusions import visible_shares
+from worldpose.body_fitting.bones import Shape
+from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.dataset import manifest as manifests
 from worldpose.dataset.contents import camera_files
+from worldpose.dataset.plausibility import mean_visible, rig_findings
 from worldpose.dataset.statistics import clip_statistics, data_set_statistics, read_places
+from worldpose.dataset.subjects import SubjectFit, subject_findings, write_subjects
 from worldpose.errors import InputError, UsageError
 from worldpose.formats import challenge, joints_file, release_cameras
 from worldpose.formats.archives import Member, read_archive, write_archive, wrong
 from worldpose.formats.files import read_yaml
+from worldpose.geometry.cameras import Camera
 from worldpose.ingest.footage import unit_frames
 from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.pitch_file import NO_PITCH
@@ -84,17 +91,28 @@ def write_data_set(
         draft, truth = Path(workshop) / "public", Path(workshop) / "hidden"
         clips: dict[str, contracts.ReleasedSequence] = {}
         models: dict[str, BodyModel] = {}
+        sources: dict[Path, list[tuple[str, tuple[Origin, str]]]] = {}
         for origin, split in origins:
+            part = truth if split == "test" else draft / split
+            rig = with_brown_lenses(origin.static_cameras, f"release of {origin.spec.match_id}")
             for clip in origin.clips:
                 label = f"{origin.spec.match_id}_{clip}".replace(".", "_")
                 if label in clips:
                     todo = "Name each match once, and rename clips whose names differ by dots."
                     raise _refuse(label, "one clip of this name", "two", todo)
                 clips[label], model = _write_clip(
-                    origin, clip, label, split, Path(workshop), footage
+                    origin, clip, label, split, Path(workshop), footage, rig
                 )
-                models[model.name] = model
+                other = models.setdefault(model.name, model)
+                arrays = ([getattr(each, f.name) for each in (model, other)] for f in fields(model))
+                if not all(np.array_equal(*pair) for pair in arrays):
+                    todo = "Install them under different names, and run a match again."
+                    raise _refuse(model.name, "one body file of this name", "two", todo)
+                sources.setdefault(part, []).append((label, (origin, clip)))
         clips = _name_subjects(clips, subjects)
+        for part, of in sources.items():
+            fits = (_fits(label, clips[label].subjects, *where) for label, where in of)
+            write_subjects(part / "subjects.npz", chain.from_iterable(fits))
         parts = [part for part in (draft / "train", draft / "val", truth) if part.is_dir()]
         counted = {part: count([part]) for part in parts}
         if tested:
@@ -116,7 +134,12 @@ def write_data_set(
             raise wrong(f"{out}: {found.where[0]}", "no contradiction", found.says, todo)
         from worldpose.reports.data_set import data_set_page  # late: it loads matplotlib, 0.5 s
 
-        checks = {part.name: check(part, pitch=manifest.pitch, models=models) for part in parts}
+        checks = {}
+        for part in parts:
+            report = check(part, pitch=manifest.pitch, models=models)
+            people = subject_findings(part, {label: clips[label] for label, _ in sources[part]})
+            findings = *report.findings, *people
+            checks[part.name] = report.model_copy(update={"findings": findings})
         if tested:
             checks[truth.name] = checks[truth.name].model_copy(update={"clips": {}})
         page = data_set_page(name, manifest.statistics, checks, manifest)
@@ -139,12 +162,34 @@ def _listed(folder: Path) -> tuple[StoredFile, ...]:
     return manifests.released_files(folder, [path for path in folder.rglob("*") if path.is_file()])
 
 
+def _fits(label: str, subjects: Sequence[str], origin: Origin, clip: str) -> Iterator[SubjectFit]:
+    """Yield the shapes of a clip's people by its static cameras, without those of other clips."""
+    run, unit = origin.run, f"body_fitting/{clip}"
+    if unit not in run:
+        return
+    settings = BodyFittingSettings.model_validate(run.record.settings["body_fitting"])
+    rows = run[best_results.bodies_unit(run, clip)]["person"].values.tolist()
+    subject_of = dict(zip(rows, subjects, strict=True))
+    arrays = (run[unit][each].values for each in ("person", "betas", "betas_covariance"))
+    for person, *shape in zip(*arrays, strict=True):
+        if (who := subject_of.get(person)) and np.isfinite(shape[0]).all():
+            model = str(run[unit].attrs["body_model"])
+            yield SubjectFit(who, model, label, Shape(*shape), settings.prior_weight)
+
+
 def _write_clip(
-    origin: Origin, clip: str, name: str, split: contracts.Split, root: Path, footage: FootageForm
+    origin: Origin,
+    clip: str,
+    name: str,
+    split: contracts.Split,
+    root: Path,
+    footage: FootageForm,
+    rig: tuple[Mapping[str, Camera], Mapping[str, Mapping[str, str | float | None]]],
 ) -> tuple[contracts.ReleasedSequence, BodyModel]:
     """Write the files of one clip below `root`, the truth of a test part apart from the rest.
 
-    Returns the entry of the clip, and its body model.
+    Returns the entry of the clip, and its body model. The rig has static cameras with Brown's
+    lenses, and the errors of those that had another.
     """
     public = root / "public" / split
     part = root / "hidden" if split == "test" else public
@@ -167,6 +212,17 @@ def _write_clip(
         if footage != "none":
             videos[label] = _write_footage(origin, view, public / "footage" / label, footage)
             images[label] = unit_frames(spec, view).number(spec.clips_of(view)[0].first_frame)
+    changes, still = view_changes(origin.run, clip), dict[str, contracts.RigCamera]()
+    for camera_id, camera in rig[0].items():
+        path = part / "cameras" / name / f"{camera_id}.npz"
+        release_cameras.write_static_camera(path, camera.to_calibration(camera_id))
+        width, height = camera.image_size.tolist()
+        still[camera_id] = contracts.RigCamera(
+            image_size=(width, height),
+            visible=mean_visible(tracks.joints, camera),
+            lens=rig[1].get(camera_id),
+            changes=tuple(each for each in changes if each.camera == camera_id),
+        )
     found = best_results.tracked_people(origin.run, clip)[1]
     named = {person: track.name or f"{clip}/{person}" for person, track in found.items()}
     released = contracts.ReleasedSequence(
@@ -181,6 +237,7 @@ def _write_clip(
         body_model=model.name,
         subjects=tuple(f"{spec.match_id}/{named[person]}" for person in people.tolist()),
         views=views,
+        rig=still,
         footage=videos,
         first_images=images,
     )
@@ -264,11 +321,18 @@ def check_data_set(folder: Path, hidden: Path | None = None) -> contracts.CheckR
     manifest = manifests.read_data_set(folder)
     findings = [*_file_findings(folder, hidden, manifest), *_statement_findings(manifest)]
     figures: dict[str, contracts.ClipFigures] = {}
+    rigs: dict[tuple[str, str], bytes] = {}
+    parts: dict[str, Path | None] = {**{s: folder / s for s in ("train", "val")}, "test": hidden}
+    for split, part in parts.items():
+        own = {name: clip for name, clip in manifest.clips.items() if clip.split == split}
+        if part is not None and own:
+            findings += subject_findings(part, own)
     for name, clip in manifest.clips.items():
-        part = folder / clip.split if clip.split != "test" else hidden
+        part = parts[clip.split]
         try:
             findings += _view_findings(folder / clip.split, part, name, clip)
             if part is not None:
+                findings += rig_findings(part, name, clip, rigs)
                 findings += _clip_findings(part, name, clip, manifest.statistics.clips.get(name))
                 report = check(part, pitch=manifest.pitch, only=name)
                 figures |= report.clips
@@ -315,7 +379,8 @@ def _file_findings(
             poses = release_cameras.read_camera_rows(path).rotation if kind == "cameras" else poses
         except InputError as error:
             yield _damage("unreadable", str(error), name)
-        if np.isfinite(poses).sum() > 9 or kind not in ("cameras", "boxes", "footage"):
+        still = kind == "cameras" and name.count("/") > 2
+        if still or np.isfinite(poses).sum() > 9 or kind not in ("cameras", "boxes", "footage"):
             truth.append(name)
     if truth:
         yield _damage("test_truth", "the public test part has truth that must be hidden", *truth)

@@ -124,8 +124,9 @@ def score(
         mine, tracks, notes = align_positions(Path(reference), estimate.joints, first, known)
         estimate, truth = replace(estimate, joints=mine), Side(tracks, {})
     spec = None if match is None else match.spec
-    if truth.joints is not None:
-        truth = replace(truth, joints=drop_views(truth.joints, spec))
+    if truth.joints is not None:  # views are of the reference's cameras, not the prediction's
+        own = None if truth.match is None else truth.match.spec
+        truth = replace(truth, joints=drop_views(truth.joints, own))
     true_cameras = cameras_of(reference, truth, spec)
     if match_in is not None and match_in not in true_cameras:
         raise UsageError(
@@ -183,16 +184,6 @@ def _align_markers(
     return align_reference(prediction, joints, markers.rate, fps, markers.start)
 
 
-def load_reference(name: str) -> JointTracks:
-    """Load true joints from a joints file, or from a folder with `joints.npz`.
-
-    Raises:
-        InputError: there is no such file, or it is not a joints file.
-    """
-    path = Path(name)
-    return read_joints(path / "joints.npz" if path.is_dir() else path)
-
-
 def reference_side(name: str) -> Side:
     """Load the data of a ground truth file or folder, and the match next to it.
 
@@ -207,12 +198,9 @@ def reference_side(name: str) -> Side:
     clip = path.name.removesuffix(".npz").removesuffix(".joints")
     rate = stated_rate(folder, clip)
     files = sorted((path / "cameras").glob("*.npz"))
-    if path.is_dir() and files:
-        joints = load_reference(name) if (path / "joints.npz").is_file() else None
-        cameras = {file.stem: read_camera(file) for file in files}
-    else:
-        joints, cameras = load_reference(name), {}
-    return Side(joints, cameras, match, fps=rate)
+    of_joints = path / "joints.npz" if path.is_dir() else path
+    joints = read_joints(of_joints) if of_joints.is_file() or not files else None
+    return Side(joints, {file.stem: read_camera(file) for file in files}, match, fps=rate)
 
 
 def is_of_files(name: str) -> bool:

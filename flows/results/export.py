@@ -30,6 +30,7 @@ from flows.results.run_cameras import (
     moving_cameras,
     static_cameras,
     view_changes,
+    with_brown_lenses,
 )
 from flows.results.tool_exports import (
     TOOL_EXPORTS,
@@ -49,8 +50,6 @@ from worldpose.formats.joints_file import write_joints, write_poses
 from worldpose.formats.release_cameras import write_moving_camera, write_static_camera
 from worldpose.formats.tables import write_positions
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.lens_fit import fit_brown_lens
-from worldpose.geometry.lens_models import LensModel
 from worldpose.ingest.footage import image_clock, unit_frames
 from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.pitch.template import PitchTemplate
@@ -58,8 +57,6 @@ from worldpose.store.runs import pin_run, read_pin
 from worldpose.store.store import Run, Store
 from worldpose.video.files import write_video
 
-LENS_ERRORS = "lens_errors.json"
-"""Largest differences of the lenses in cameras/ from those of the run [px]."""
 CAMERA_CHANGES = "camera_changes"
 """Folder of how static cameras' views change within each clip; cameras/ is from before."""
 PITCH_SPACING = 0.5
@@ -88,12 +85,7 @@ def export_worldpose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     rates = (unit_frames(origin.spec, view).rate for view in broadcast_views(origin.run))
     others = bool(with_people or origin.static_cameras) or 1.0 in rates
     # Before the first file: one lens that cannot be followed refuses the export.
-    cameras = dict(origin.static_cameras)
-    errors: dict[str, dict[str, str | float | None]] = {}
-    for name, camera in cameras.items():
-        if camera.lens_model != LensModel.BROWN:
-            cameras[name], off = fit_brown_lens(camera, f"--format worldpose: {name}")
-            errors[name] = {"lens_model": LensModel(int(camera.lens_model)).label, **off}
+    cameras, errors = with_brown_lenses(origin.static_cameras, "--format worldpose")
     for clip in best_results.all_clips(origin.run):
         if clip in with_people:
             model, poses, *_ = best_results.fitted_bodies(origin.run, clip)
@@ -115,10 +107,8 @@ def export_worldpose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
         path = out / "cameras" / f"{name}.npz"
         write_static_camera(path, camera.to_calibration(name))
         yield path
-    if errors:
-        path = out / LENS_ERRORS
-        path.write_text(json.dumps(errors, indent=1), encoding="utf-8")
-        yield path
+    if (stated := manifests.write_lens_errors(out, dict.fromkeys(cameras) | errors)) is not None:
+        yield stated
 
 
 def export_challenge(
@@ -333,10 +323,14 @@ def export(
     match_id = origin.spec.match_id
 
     def claim(folder: Path, drafts: Mapping[str, Path]) -> None:
-        clips = best_results.all_clips(origin.run)
-        own_whole(folder, drafts, clips, (match_id,), overwrite=overwrite)
+        own_whole(folder, drafts, _entries(origin), (match_id,), overwrite=overwrite)
 
     return write_whole(out, write, claim)
+
+
+def _entries(origin: best_results.Origin) -> list[str]:
+    """Return the clips and cameras of which shared files tell."""
+    return [*best_results.all_clips(origin.run), *origin.static_cameras]
 
 
 def forms_without_people(run: Run, spec: MatchSpec) -> tuple[str, ...]:
@@ -445,8 +439,8 @@ def release(
 
     def claim(folder: Path, drafts: Mapping[str, Path]) -> None:
         released = f"{RELEASE}{name} of {spec.match_id}"
-        clips, owners = best_results.all_clips(origin.run), (released, spec.match_id)
-        own_whole(folder, drafts, clips, owners, overwrite=False, record=False)
+        owners = released, spec.match_id
+        own_whole(folder, drafts, _entries(origin), owners, overwrite=False, record=False)
 
     return write_whole(out, lambda place: _write_release(origin, forms, place, ours), claim)
 

@@ -12,7 +12,13 @@ from typing import Final
 
 from pydantic import TypeAdapter, ValidationError
 
-from worldpose.dataset.manifest import FRAME_RATES, KINDS, MANIFEST, read_manifest
+from worldpose.dataset.manifest import (
+    FRAME_RATES,
+    KINDS,
+    LENS_ERRORS,
+    MANIFEST,
+    read_manifest,
+)
 from worldpose.errors import InputError
 from worldpose.formats.files import FULL, whole_file
 
@@ -22,8 +28,8 @@ VIEWER_SUFFIX: Final = ".html"
 """An output that ends so is one viewer file, not a folder."""
 RELEASE: Final = "release "
 """Begins the owner of released files, which nothing replaces."""
-SHARED: Final = frozenset({FRAME_RATES, KINDS})
-"""Files to which exports of further clips are added."""
+SHARED: Final = frozenset({FRAME_RATES, KINDS, LENS_ERRORS})
+"""Files to which exports of further clips and cameras are added."""
 _OWNERS: Final = TypeAdapter(dict[str, str])
 
 
@@ -36,7 +42,8 @@ def read_owners(folder: Path) -> dict[str, str]:
     manifest = read_manifest(folder)
     if manifest is not None:
         files = {file.path for file in manifest.files}
-        entries = (f"{name}: {clip}" for name in SHARED & files for clip in manifest.clips)
+        of = {*manifest.clips, *manifest.pictures}
+        entries = (f"{name}: {each}" for name in SHARED & files for each in of)
         released = (MANIFEST, *files, *entries)
         owners |= dict.fromkeys(released, f"{RELEASE}{manifest.release} of {manifest.match_id}")
     return owners

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 
 from data_contracts.arrays import Integers
 from data_contracts.match import MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.triangulation import CameraChange
 from worldpose.geometry.cameras import Camera, camera_from_arrays
+from worldpose.geometry.lens_fit import fit_brown_lens
+from worldpose.geometry.lens_models import LensModel
 from worldpose.static_calibration.venue import Venue, join_cameras
 from worldpose.store.store import Run
 
@@ -83,6 +85,22 @@ def static_cameras(run: Run, spec: MatchSpec, stage: str | None = None) -> dict[
     if venue is None:
         return {}
     return {camera_id: venue.cameras[index] for index, camera_id in enumerate(camera_ids)}
+
+
+def with_brown_lenses(
+    cameras: Mapping[str, Camera], where: str
+) -> tuple[dict[str, Camera], dict[str, dict[str, str | float | None]]]:
+    """Return cameras with Brown's lenses, and the errors of those that had another, by id.
+
+    Raises:
+        InputError: Brown's model does not follow a lens; `where` tells what is written.
+    """
+    found, errors = dict(cameras), dict[str, dict[str, str | float | None]]()
+    for name, camera in cameras.items():
+        if camera.lens_model != LensModel.BROWN:
+            found[name], off = fit_brown_lens(camera, f"{where}: {name}")
+            errors[name] = {"lens_model": LensModel(int(camera.lens_model)).label, **off}
+    return found, errors
 
 
 def _join_calibrated(run: Run, spec: MatchSpec) -> tuple[Venue | None, list[str]]:

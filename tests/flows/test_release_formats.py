@@ -25,6 +25,7 @@ from worldpose.errors import InputError, UsageError
 from worldpose.formats.challenge import read_challenge, read_submission
 from worldpose.formats.joints_file import read_poses
 from worldpose.formats.release_cameras import read_camera
+from worldpose.geometry.lens_models import LensModel
 
 FRAMES = np.arange(100, 104)
 
@@ -230,7 +231,7 @@ def test_other_methods_get_our_boxes_as_mot_lines(match_folder, tmp_path, caplog
             write(form, run, tmp_path / "slower")
     with_joints = replace(run, run=origin(match_folder, **tracked()).run)
     with pytest.raises(InputError, match="found 25 images per second, and 50 frames"):
-        _write_clip(with_joints, "A_1", "m_A_1", "train", tmp_path / "released", "none")
+        _write_clip(with_joints, "A_1", "m_A_1", "train", tmp_path / "released", "none", ({}, {}))
     names = [path.name for path in write("worldpose", run, tmp_path / "slower")]
     assert names == ["A_1.npz", "A_1.json"]
     assert not (tmp_path / "slower" / "cameras").exists() and "view A_1" in caplog.text
@@ -341,6 +342,28 @@ def test_a_match_changes_no_frame_rate_of_another_matchs_files(match_folder, tmp
         export(run, ["joints"], out)
     export(run, ["joints"], out, overwrite=True)
     assert json.loads(rates.read_text()) == {"A_1": 50.0}
+
+
+def test_matches_in_one_folder_state_the_lens_of_each_camera(match_folder, tmp_path):
+    def export_rig(match, camera, model):
+        lens = (-0.05, 0.02, 0.0, 0.0, -0.01, 0.0, 0.0, 0.0)
+        arrays = {"focal": [1500.0, 1500.0], "principal_point": [960.0, 540.0], "distortion": lens}
+        arrays |= {"rotation": np.eye(3), "translation": np.zeros(3), "image_size": [1920, 1080]}
+        rig = xr.Dataset(coords={"camera": [camera]})
+        for name, value in {**arrays, "lens_model": model}.items():
+            dims = [f"{name}{d}" for d in range(np.ndim(value))]
+            rig[name] = (("camera", *dims), np.array(value)[None])
+        run = origin(match_folder, **tracked(), bundle_adjustment__cameras=rig)
+        spec = run.spec.model_copy(update={"match_id": match})
+        about = SimpleNamespace(spec=spec, folder=str(match_folder))
+        export(replace(run, registration=about), ["worldpose"], tmp_path / "out")
+        return json.loads((tmp_path / "out" / "lens_errors.json").read_text())
+
+    assert export_rig("m", "north", LensModel.FISHEYE).keys() == {"north"}
+    assert export_rig("other", "south", LensModel.FISHEYE).keys() == {"north", "south"}
+    with pytest.raises(InputError, match="south"):
+        export_rig("m", "south", LensModel.RATIONAL)
+    assert export_rig("m", "north", LensModel.BROWN).keys() == {"south"}
 
 
 def test_filled_joints_are_flagged(match_folder, tmp_path):

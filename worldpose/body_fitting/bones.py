@@ -143,7 +143,7 @@ def agree(one: Shape, other: Shape) -> bool:
     return bool(squared <= chdtri(len(away), 0.001))
 
 
-def pool_shapes(shapes: Sequence[Shape], weight: float) -> Shape:
+def pool_shapes(shapes: Sequence[Shape], weights: Sequence[float]) -> Shape:
     """Return one person's shape from several clips: information-weighted means.
 
     Every covariance includes the normal prior of betas, which counts once. Clips count as
@@ -151,11 +151,11 @@ def pool_shapes(shapes: Sequence[Shape], weight: float) -> Shape:
 
     Args:
         shapes: shapes of one person and body model, at least one.
-        weight: weight of that prior in every one of them [1], `shape_weight` of the settings.
+        weights: weight of that prior in each of them [1], `prior_weight` of the settings.
     """
-    prior_precision = weight * np.eye(len(shapes[0].betas))
+    further = max(weights) - sum(weights)
     precisions = [np.linalg.inv(shape.covariance) for shape in shapes]
-    precision = sum(precisions, start=-(len(shapes) - 1.0) * prior_precision)
+    precision = sum(precisions, start=further * np.eye(len(shapes[0].betas)))
     weighted = [own @ shape.betas for own, shape in zip(precisions, shapes, strict=True)]
     covariance = np.linalg.inv(precision).astype(np.float64)
     return Shape(covariance @ np.sum(weighted, axis=0), covariance)

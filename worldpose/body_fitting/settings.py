@@ -91,6 +91,14 @@ class BodyFittingSettings(Record):
     max_filled_gap_s: float = Field(default=1.0, ge=0, le=100)
     """Gaps up to this are filled by motion [s]; in longer ones a person is missing."""
 
+    @property
+    def prior_weight(self) -> float:
+        """Return the weight of the betas' normal distribution in a shape's covariance [1].
+
+        The paper's shapes have none: their unit covariance makes the mean of several a plain one.
+        """
+        return 0.0 if self.method == "paper" else self.shape_weight
+
     def repeated(self, fps: float) -> float:
         """Return the number of frames of a clip that count as one observation [1]."""
         return 1.0 + self.noise_time_s * fps

@@ -211,6 +211,8 @@ def read_clip(
         ids = manifest.clips[clip].person_ids
     own, static = camera_files(folder, clip, clips)
     rows = {path.stem: read_camera_rows(path) for path in sorted((*own, *static))}
+    rig = sorted((folder / "cameras" / clip).glob("*.npz"))
+    rows |= {f"{clip}/{path.stem}": read_camera_rows(path) for path in rig}
     frames = max((len(source.points) for source in sources), default=0)
     coco = folder if len(clips) == 1 else folder / clip
     views, notes = list[CameraView](), list[str]()

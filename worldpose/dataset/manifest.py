@@ -112,7 +112,8 @@ _RATES = TypeAdapter(dict[str, PositiveFloat])
 
 KINDS: Final = "kinds.json"
 """File with the kind of every person: triangulated, mixed or plane."""
-_KINDS = TypeAdapter(dict[str, dict[str, str]])
+LENS_ERRORS: Final = "lens_errors.json"
+"""File with the largest differences of the lenses in cameras/ from those of the run [px]."""
 
 
 def write_kinds(folder: Path, kinds: Mapping[str, Mapping[int, str]]) -> Path:
@@ -122,9 +123,28 @@ def write_kinds(folder: Path, kinds: Mapping[str, Mapping[int, str]]) -> Path:
         InputError: the existing file has another format.
     """
     path, expected = folder / KINDS, "clips and the kinds of their people by id"
-    known = _read(path, _KINDS, expected, "Remove the file, and export again.") or {}
+    form = TypeAdapter(dict[str, dict[str, str]])
+    known = _read(path, form, expected, "Remove the file, and export again.") or {}
     new = {clip: {str(person): kind for person, kind in of.items()} for clip, of in kinds.items()}
     return _write(path, known | new)
+
+
+def write_lens_errors(
+    folder: Path, errors: Mapping[str, Mapping[str, str | float | None] | None]
+) -> Path | None:
+    """Replace cameras' entries in the folder's lens errors; None leaves a camera out.
+
+    Returns:
+        The file; None if no camera has an entry before or after.
+
+    Raises:
+        InputError: the existing file has another format.
+    """
+    path, expected = folder / LENS_ERRORS, "cameras and the errors of their lenses"
+    form = TypeAdapter(dict[str, dict[str, str | float | None]])
+    known = _read(path, form, expected, "Remove the file, and export again.") or {}
+    found = {name: each for name, each in {**known, **errors}.items() if each is not None}
+    return _write(path, found) if known or found else None
 
 
 def write_frame_rates(folder: Path, rates: Mapping[str, float]) -> Path:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from data_contracts.arrays import Flags, Floats
-from data_contracts.release import Finding
+from data_contracts.release import Finding, ReleasedSequence
+from worldpose.body.occlusions import visible_shares
 from worldpose.dataset.contents import (
     CameraView,
     PointSource,
@@ -24,7 +26,9 @@ from worldpose.dataset.faults import (
     frame_faults,
     point_faults,
 )
-from worldpose.formats.release_cameras import CameraRows
+from worldpose.formats.joints_file import read_joints
+from worldpose.formats.release_cameras import CameraRows, read_camera
+from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import align, unit
 
 BONES = {
@@ -385,3 +389,29 @@ def _left(seen: Floats, points: Floats, rows: CameraRows, late: int, at: int) ->
         away = np.where(ahead, turned[:, :2] / np.where(ahead, turned[:, 2:], 1.0) - plane, np.inf)
         errors.append(np.linalg.norm(away * camera.focal[frame], axis=-1))
     return float(np.median(np.concatenate(errors))) if errors else np.inf
+
+
+def mean_visible(joints: Floats, camera: Camera) -> float | None:
+    """Return the mean of `visible_shares` over people and frames [1]; None without people."""
+    shares = visible_shares(joints, camera)
+    return float(np.nanmean(shares)) if np.isfinite(shares).any() else None
+
+
+def rig_findings(
+    part: Path, name: str, clip: ReleasedSequence, rigs: dict[tuple[str, str], bytes]
+) -> Iterator[Finding]:
+    """Yield faults of a clip's static cameras; `rigs` has the files of the match's other clips."""
+    files = {path.stem: path for path in (part / "cameras" / name).glob("*.npz")}
+    if files.keys() != clip.rig.keys():
+        says = "static cameras are not those of the files"
+        yield Finding(fault="views_differ", kind="damage", where=(name,), says=says)
+    joints = read_joints(part / f"{name}.joints.npz").joints
+    for each in sorted(files.keys() & clip.rig):
+        camera = read_camera(files[each], clip.rig[each].image_size)
+        content, key = files[each].read_bytes(), (clip.match_id, each)
+        same = camera.batch_shape == () and content == rigs.setdefault(key, content)
+        seen, stated = (mean_visible(joints, camera) if same else None), clip.rig[each].visible
+        if not same or abs((seen or 0.0) - (stated or 0.0)) > 1e-6:
+            where = (f"{clip.split}/cameras/{name}/{each}.npz",)
+            says = "not the camera of the match's rig, or it shows other people than stated"
+            yield Finding(fault="camera_differs", kind="damage", where=where, says=says)

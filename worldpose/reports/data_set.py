@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from data_contracts.arrays import Floats
-from data_contracts.release import CheckReport, DataSetManifest, DataSetStatistics
+from data_contracts.release import CheckReport, DataSetManifest, DataSetStatistics, RigCamera
 from worldpose.dataset.benchmark import Sample
 from worldpose.reports.drawing import GRASS, INK, PALE, draw_skeleton, person_color, png, style
 from worldpose.reports.html_page import CaptionedImage, Failure, Section, Table, whole_page
@@ -70,12 +70,36 @@ def _composition(manifest: DataSetManifest) -> Section:
     blocks = [Table("", ("split", "matches", "body model", *numbers), tuple(splits))]
     if several:
         blocks.append(Table("Subjects of several clips", ("subject", "clips"), several))
+    blocks.append(_static_cameras(manifest))
     lead = (
         "A match belongs to one split, and so does every subject. Nameless people without an entry "
         "in the registry count once per clip. The truth of a test part is hidden: the part has "
-        "boxes, and cameras with the pose of the first frame alone. Statistics are without it."
+        "boxes, and cameras with the pose of the first frame alone. Statistics are without it. "
+        "subjects.npz has a shape of each subject and body model, from all clips of a part."
     )
     return Section("Composition", tuple(blocks), lead)
+
+
+def _static_cameras(manifest: DataSetManifest) -> Table:
+    """Return the static cameras of each match: sizes, lenses but Brown's, and views that change."""
+    rigs: dict[str, dict[str, RigCamera]] = {}
+    changed: dict[str, list[str]] = {}
+    for name, clip in manifest.clips.items():
+        rigs.setdefault(clip.match_id, {}).update(clip.rig)
+        moved = (f"{each} in {name}" for each, camera in clip.rig.items() if camera.changes)
+        changed.setdefault(clip.match_id, []).extend(moved)
+    rows = []
+    for match, rig in rigs.items():
+        sizes = dict.fromkeys("{} x {}".format(*camera.image_size) for camera in rig.values())
+        lenses = (
+            f"{name}: {camera.lens['lens_model']}, {camera.lens['max_error_px']:.2g} px off"
+            for name, camera in rig.items()
+            if camera.lens
+        )
+        said = (", ".join(each) or "-" for each in (sizes, lenses, changed[match]))
+        rows.append((match, f"{len(rig)}", *said))
+    titles = ("match", ">cameras", "images [px]", "lenses but Brown's", "views that change")
+    return Table("Static cameras, cameras/<clip>/<camera>.npz", titles, tuple(rows))
 
 
 def counted_section(found: DataSetStatistics) -> Section:

@@ -237,21 +237,22 @@ class Scene:
     clicks: dict[str, Clicks]
     surveyed: PitchSpec
 
-    def static_views(self, names: Sequence[str] | None = None) -> StaticViews:
-        """Return the detections of static cameras in one array, by default of all of them."""
-        names = list(self.cameras) if names is None else names
-        seen = [self.observations[name] for name in names]
-        frames = self.truth.frames
-        shape = (len(frames), len(seen), max(each.keypoints.shape[1] for each in seen), 17)
-        keypoints, confidence = np.full((*shape, 2), np.nan), np.full(shape, np.nan)
-        person, displaced = np.full(shape[:3], -1, np.int16), np.zeros(shape, np.bool_)
-        for c, (name, each) in enumerate(zip(names, seen, strict=True)):
-            rows, last = np.searchsorted(frames, each.frame), each.keypoints.shape[1]
-            keypoints[rows, c, :last] = each.keypoints
-            confidence[rows, c, :last] = each.confidence
-            person[rows, c, :last] = self.identities[name].person
-            displaced[rows, c, :last] = self.identities[name].displaced
-        detections = KeypointDetections.from_keypoints(keypoints, confidence, frame=frames)
+    def static_views(self) -> StaticViews:
+        """Return the detections of static cameras in one array."""
+        names = list(self.cameras)
+        seen = KeypointDetections.stack([self.observations[name] for name in names])
+        shape = seen.score.shape
+        person, displaced = np.full(shape, -1, np.int16), np.zeros((*shape, 17), np.bool_)
+        for c, name in enumerate(names):
+            found = self.identities[name]
+            rows, last = (
+                np.searchsorted(seen.frame, found.observations.frame),
+                found.person.shape[1],
+            )
+            person[rows, c, :last] = found.person
+            displaced[rows, c, :last] = found.displaced
+        points, sure = seen.keypoints.astype(np.float64), seen.confidence.astype(np.float64)
+        detections = KeypointDetections.from_keypoints(points, sure, frame=seen.frame)
         return StaticViews(detections, person, displaced)
 
 

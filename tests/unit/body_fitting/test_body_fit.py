@@ -281,10 +281,16 @@ def test_a_person_of_several_clips_is_what_they_say_together_with_anybody_counte
     # Each clip knows the first component to 0.5 besides the prior: 1 / (1 + 4) of variance.
     covariance = np.diag([0.2, 1.0])
     clips = [Shape(np.array([0.8 * seen, 0.0]), covariance) for seen in (1.0, 2.0)]
-    pooled = pool_shapes(clips, 1.0)
+    pooled = pool_shapes(clips, [1.0, 1.0])
     # Two correlated_frames of precision 4 and the prior's 1: (4 x 1 + 4 x 2) / 9.
     np.testing.assert_allclose(pooled.betas, [12.0 / 9.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(pooled.covariance, np.diag([1.0 / 9.0, 1.0]), atol=1e-12)
+    # The paper's shapes have no prior and no covariance: their mean, not their sum.
+    mean = pool_shapes(
+        [Shape(np.full(2, seen), np.eye(2)) for seen in (1.0, 2.0)],
+        [BodyFittingSettings(method="paper").prior_weight] * 2,
+    )
+    np.testing.assert_allclose(mean.betas, 1.5, atol=1e-12)
     # One in a thousand pairs of clips of one person is farther apart, 13.8 of two betas.
     limit = np.sqrt(13.8 * 0.4)
     for apart, said in ((limit, True), (limit + 0.01, False)):

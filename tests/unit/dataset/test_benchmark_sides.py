@@ -74,6 +74,9 @@ def test_people_whom_one_camera_saw_count_by_no_door_unless_the_match_has_none(t
 
     write_joints(reference / "joints.npz", JointTracks(frames, persons, joints, views=views))
     np.testing.assert_allclose(told(), [[1, 10.0]] * 2)
+    write_match(found, "broadcast")  # a prediction's match says nothing of the reference's views
+    np.testing.assert_allclose(told(), [[1, 10.0]] * 2)
+    (found / "match.yaml").unlink()
     write_match(tmp_path / "match", "static")
     np.testing.assert_allclose(told(), [[1, 10.0]] * 2)
     write_match(tmp_path / "match", "broadcast")

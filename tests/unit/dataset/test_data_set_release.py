@@ -18,14 +18,18 @@ from flows.results.data_set_release import ASSETS, check_data_set, write_data_se
 from worldpose.body.body_file import save_body
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.occlusions import hidden_joints, visible_shares
+from worldpose.body_fitting.bones import Shape
 from worldpose.dataset.benchmark import score_folders
 from worldpose.dataset.manifest import read_data_set, released_files
+from worldpose.dataset.subjects import SubjectFit, read_subjects, write_subjects
 from worldpose.errors import InputError, UsageError
 from worldpose.store.runs import list_pins
 from worldpose.store.store import Store
 
 HALF = 8
 """Frames of a clip."""
+COVARIANCE = 0.2 * np.eye(10)
+"""Of every clip's betas, with a prior of weight 0.5."""
 SPLITS = {"ann-1": "train", "bea-1": "val", "cleo-1": "test"}
 CLIP = "ann-1_A"
 
@@ -42,6 +46,7 @@ def results(model, poses, camera, clip, first):
         "views": (("frame", "person", "joint"), np.full(joints.shape[:3], 3)),
     }
     fits = {"betas": (("person", "shape"), some.betas[:, 0])}
+    fits["betas_covariance"] = (("person", "shape", "shape_"), np.stack([COVARIANCE] * PERSONS))
     for name in ("global_orient", "body_pose", "transl"):
         rows = getattr(some, name).swapaxes(0, 1)
         fits[name] = (("frame", "person", f"{name}_"), rows)
@@ -56,9 +61,16 @@ def results(model, poses, camera, clip, first):
     moving["rotation"] = (("frame", "a", "b"), np.array(rows.cam_from_world.rotation))
     moving["image_size"] = (("side",), np.array([1920, 1080]))
     attrs = {"clip_id": clip, "pitch": None}
+    still = {key: (dims, values[:1]) for key, (dims, values) in moving.items() if len(dims) > 1}
+    rig = xr.Dataset(
+        {key: (("camera", *dims[1:]), values) for key, (dims, values) in still.items()}
+        | {"image_size": (("camera", "side"), np.array([[1920, 1080]]))},
+        coords={"camera": ["north"]},
+    )
     return {
         f"tracking/{clip}": xr.Dataset(coords=coordinates, attrs={"tracks": tracks}),
-        f"triangulation/{clip}": xr.Dataset(placed, coords=coordinates),
+        f"triangulation/{clip}": xr.Dataset(placed, coords=coordinates, attrs={"changes": []}),
+        "bundle_adjustment/cameras": rig,
         f"body_fitting/{clip}": xr.Dataset(
             fits | placed, coords=coordinates, attrs={"body_model": model.name}
         ),
@@ -90,7 +102,9 @@ def origins(model, poses, main_camera, tmp_path_factory):
             return hashlib.sha256((folder / path).read_bytes()).hexdigest()
 
         registration = SimpleNamespace(spec=spec, folder=str(folder), digest_of=digest_of)
-        run = StubRun(parts[0] | parts[1], store, match_id=match)
+        settings = {"body_fitting": {}}
+        # The rig is the second clip's in both, as a run has one.
+        run = StubRun(parts[0] | parts[1], store, match_id=match, settings=settings)
         found.append((Origin(run, registration), split))
     return store, found
 
@@ -124,7 +138,51 @@ def test_a_release_has_the_bodies_of_the_folder_of_its_run(model, origins, tmp_p
     assert {clip.body_model for clip in written.clips.values()} == {"smpl-test"}
 
 
-def test_a_sound_data_set_passes_and_hides_the_truth(written):
+def test_two_bodies_of_one_name_are_refused(model, origins, tmp_path):
+    store, [*_, (origin, _)] = origins
+    own = replace(model, name="smpl-test", shape_directions=2.0 * model.shape_directions)
+    runs = []
+    for match, body in (("ann-1", replace(model, name="smpl-test")), ("bea-1", own)):
+        (tmp_path / match).mkdir()
+        save_body(tmp_path / match / "smpl-test.npz", body)
+        parts = {name: part.copy() for name, part in origin.run.results.items()}
+        for name in ("body_fitting/A", "body_fitting/B"):
+            parts[name].attrs["body_model"] = "smpl-test"
+        about = vars(origin.run.record) | {"body_folder": str(tmp_path / match)}
+        del about["results"]
+        registration = replace_match(origin.registration, match)
+        runs.append((Origin(StubRun(parts, store, **about), registration), "train"))
+    with pytest.raises(UsageError, match="smpl-test: expected one body file of this name"):
+        write_data_set(store, runs, tmp_path / "set", "own", LICENCES)
+
+
+def replace_match(registration, match):
+    spec = registration.spec.model_copy(update={"match_id": match})
+    return SimpleNamespace(**vars(registration) | {"spec": spec})
+
+
+def test_a_subject_has_a_shape_of_each_body_model_and_never_a_mean_of_two(tmp_path):
+    def fit(model, clip, first):
+        shape = Shape(np.array([first, *np.zeros(9)]), COVARIANCE)
+        return SubjectFit("keeper", model, clip, shape, 0.5)
+
+    fits = [
+        fit("neutral", "a", 0.4),
+        fit("female", "b", 4.0),
+        fit("neutral", "c", 0.6),
+        SubjectFit("other", "small", "a", Shape(np.ones(4), 0.2 * np.eye(4)), 0.5),
+    ]
+    write_subjects(tmp_path / "subjects.npz", fits)
+    rows = {row[:3]: row.shape for row in read_subjects(tmp_path / "subjects.npz")}
+    # Of two clips 2 x 4.5 of information and 0.5 of the prior: 5 (0.4 + 0.6) / 9.5.
+    assert rows["keeper", "neutral", ""].betas[0] == pytest.approx(5.0 / 9.5)
+    np.testing.assert_allclose(rows["keeper", "neutral", ""].covariance, np.eye(10) / 9.5)
+    assert rows["keeper", "female", ""].betas[0] == pytest.approx(4.0)
+    assert rows["other", "small", ""].betas.shape == (4,)
+    assert len(rows) == 3 + len(fits)
+
+
+def test_a_sound_data_set_passes_and_hides_the_truth(model, written):
     report = check_data_set(written / "set", written / "truth")
     assert (report.findings, len(report.clips)) == ((), 6)
     public = {
@@ -146,12 +204,20 @@ def test_a_sound_data_set_passes_and_hides_the_truth(written):
     assert set(hidden["clips"]) == {"cleo-1_A", "cleo-1_B"}
     clip = manifest.clips["ann-1_B"]
     assert clip.first_images == {"ann-1_B": 0}
+    assert clip.rig["north"].image_size == (1920, 1080) and clip.rig["north"].lens is None
+    still = written / "set" / "train" / "cameras" / "ann-1_B" / "north.npz"
+    assert np.load(still)["R"].shape == (1, 3, 3)
+    assert (written / "truth" / "cameras" / "cleo-1_A" / "north.npz").is_file()
+    pooled = {row[:3]: row.shape for row in read_subjects(written / "set/train/subjects.npz")}
+    several, one = (pooled[who, model.name, ""] for who in ("keeper", "ann-1/A/1"))
+    assert several.covariance[0, 0] == pytest.approx(1.0 / 9.5)
+    assert one.covariance[0, 0] == pytest.approx(0.2)
     video = clip.footage["ann-1_B"]
     copied = written / "set" / video.path
     assert hashlib.sha256(copied.read_bytes()).hexdigest() == video.sha256
     page = (written / "set" / "datasheet.html").read_text()
     assert "keeper" in page and "For tests alone." in page and "data:image" in page
-    assert "ann-1, run 0001: usable" in page
+    assert "ann-1, run 0001: usable" in page and "Static cameras" in page
     assert page.count("cleo-1_A") == 0
 
 
@@ -269,6 +335,7 @@ def unreadable_camera(folder, truth):
 
 POSES, CAMERA, BOXES = (f"train/{kind}/{CLIP}.npz" for kind in ("poses", "cameras", "boxes"))
 JOINTS = f"train/{CLIP}.joints.npz"
+NORTH = "train/cameras/ann-1_B/north.npz"
 FAULTS = {
     "missing file": (lambda f, t: (f / BOXES).unlink(), "missing_files", BOXES),
     "changed digest": (
@@ -307,6 +374,38 @@ FAULTS = {
         files("test/cameras/cleo-1_A.npz", transpose_rotation),
         "camera_differs",
         "test/cameras/cleo-1_A.npz",
+    ),
+    "other static camera": (files(NORTH, put("t", (0, 1), 1.0)), "camera_differs", NORTH),
+    "transposed static camera": (
+        files("train/cameras/ann-1_A/north.npz", transpose_rotation),
+        "transposed_rotation",
+        "train/cameras/ann-1_A/north",
+    ),
+    "static camera of other images": (
+        clip(CLIP, rig={"north": {"image_size": [960, 540], "visible": 1.0}}),
+        "camera_differs",
+        "train/cameras/ann-1_A/north.npz",
+    ),
+    "static camera unstated": (clip(CLIP, rig={}), "views_differ", CLIP),
+    "static camera of the test part": (
+        lambda f, t: shutil.copytree(t / "cameras" / "cleo-1_A", f / "test/cameras/cleo-1_A"),
+        "test_truth",
+        "test/cameras/cleo-1_A/north.npz",
+    ),
+    "other pooled shape": (
+        files("train/subjects.npz", put("betas", (0, 3), 0.7)),
+        "shape_differs",
+        "train/subjects.npz",
+    ),
+    "pooled over body models": (
+        files("train/subjects.npz", put("body_models", -1, "smpl-male")),
+        "subjects_differ",
+        "train/subjects.npz",
+    ),
+    "one subject of two bodies": (
+        files("train/subjects.npz", put("betas", (-1, 0), 9.0)),
+        "subject_shapes",
+        "train/subjects.npz",
     ),
     "hidden truth": (
         files("hidden/poses/cleo-1_B.npz", put("transl", (0, 3), 0.0)),
