@@ -152,6 +152,41 @@ def test_objections_are_replayed_once_for_results_and_corrections(monkeypatch):
     assert corrections.objections_now(store, match, None) == {}
 
 
+def test_corrections_are_replayed_once_until_another_one_or_another_result(monkeypatch):
+    class Kept:
+        """A store with a run, which is the run, too."""
+
+        record = SimpleNamespace(match_id="m", run_id="0001", results={"tracking/clip": "k"})
+        run = runs = lambda self, _: self.record
+        registration = lambda self, _: None  # noqa: E731
+        has = lambda self, *_: True  # noqa: E731
+        __contains__ = has
+
+        def manifest(self, *_):
+            return SimpleNamespace(recipe=SimpleNamespace(sources={}))
+
+    run, real, replayed = Kept(), identities._replay, []
+    run.store = run
+
+    def counted(*given, **options):
+        replayed.append(given)
+        return real(*given, **options)
+
+    monkeypatch.setattr(identities, "_replay", counted)
+    monkeypatch.setattr(identities, "open_stored", lambda *_: StoredResult(tracks(), "k", []))
+    said = {"a": named(0, "Al"), "b": named(7, "Bo")}
+    for count, key in enumerate(("k", "k", "l"), 1):
+        said = said if count < 2 else {**said, "c": named(1, "Cy")}
+        run.record.results["tracking/clip"] = key
+        monkeypatch.setattr(identities, "read_journal", lambda *_: journal(said))  # noqa: B023
+        match = SimpleNamespace(match_id="m", corrections=journal(said).standing.values())
+        for _ in range(3):
+            lost = identities.lost_names(run)
+            now = identities.identities_now(run, match, "clip", with_joints=False)
+        assert (len(replayed), [*lost]) == (2 * count, ["b"])
+        assert now.identities.names == {0: "Al", **({1: "Cy"} if count > 1 else {})}
+
+
 def journal(said, withdrawn=()):
     """A journal of corrections by id, some of which were withdrawn."""
     made = {name: correction(edit, name) for name, edit in said.items()}
