@@ -153,38 +153,29 @@ def test_objections_are_replayed_once_for_results_and_corrections(monkeypatch):
 
 
 def test_corrections_are_replayed_once_until_another_one_or_another_result(monkeypatch):
-    class Kept:
-        """A store with a run, which is the run, too."""
+    class Run(dict):
+        """A run, and its store."""
 
-        record = SimpleNamespace(match_id="m", run_id="0001", results={"tracking/clip": "k"})
+        record = SimpleNamespace(match_id="m", run_id="0001", results={})
+        __hash__ = object.__hash__
         run = runs = lambda self, _: self.record
         registration = lambda self, _: None  # noqa: E731
         has = lambda self, *_: True  # noqa: E731
-        __contains__ = has
+        manifest = lambda self, *_: SimpleNamespace(recipe=SimpleNamespace(sources={}))  # noqa: E731
 
-        def manifest(self, *_):
-            return SimpleNamespace(recipe=SimpleNamespace(sources={}))
-
-    run, real, replayed = Kept(), identities._replay, []
+    run, real, made = Run({"tracking/clip": None}), identities._replay, []
     run.store = run
-
-    def counted(*given, **options):
-        replayed.append(given)
-        return real(*given, **options)
-
-    monkeypatch.setattr(identities, "_replay", counted)
+    monkeypatch.setattr(identities, "_replay", lambda *a, **k: made.append(a) or real(*a, **k))
     monkeypatch.setattr(identities, "open_stored", lambda *_: StoredResult(tracks(), "k", []))
-    said = {"a": named(0, "Al"), "b": named(7, "Bo")}
-    for count, key in enumerate(("k", "k", "l"), 1):
-        said = said if count < 2 else {**said, "c": named(1, "Cy")}
+    first, later = {"a": named(0, "Al"), "b": named(7, "Bo")}, {"c": named(1, "Cy")}
+    for count, key, said in ((2, "k", first), (4, "k", first | later), (6, "l", first | later)):
         run.record.results["tracking/clip"] = key
-        monkeypatch.setattr(identities, "read_journal", lambda *_: journal(said))  # noqa: B023
+        monkeypatch.setattr(identities, "read_journal", lambda *_, said=said: journal(said))
         match = SimpleNamespace(match_id="m", corrections=journal(said).standing.values())
         for _ in range(3):
-            lost = identities.lost_names(run)
-            now = identities.identities_now(run, match, "clip", with_joints=False)
-        assert (len(replayed), [*lost]) == (2 * count, ["b"])
-        assert now.identities.names == {0: "Al", **({1: "Cy"} if count > 1 else {})}
+            assert [*identities.lost_names(run)] == ["b"]
+            now = identities.identities_now(run, match, "clip", with_joints=False).identities
+        assert (len(made), len(now.names)) == (count, 1 + ("c" in said))
 
 
 def journal(said, withdrawn=()):

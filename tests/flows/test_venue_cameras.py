@@ -53,7 +53,8 @@ def test_the_inbox_and_a_page_name_cameras_by_one_rule_in_all_parts(at, tmp_path
 def test_an_import_states_its_venue_and_a_calibration_may_have_its_names(at, tmp_path):
     (store, folder), out = at, tmp_path / "made"
     given = ("--calibration", folder / "reference" / "calibration.toml", "--fps", 25)
-    given += ("--detections", folder / "detections", "--out", out, "--project", store.url)
+    given += ("--detections", folder / "detections", "--out", out, "--unit", "m", "--up", "z")
+    given += ("--project", store.url)
     answer = worldpose("import", *given, "--venue", "other")
     assert answer.code == 1 and "venue other: expected its settings" in answer.err
     succeed("import", *given, "--venue", "parken")

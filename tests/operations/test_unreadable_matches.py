@@ -5,7 +5,6 @@ import os
 import re
 import shutil
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime
 from threading import Event, active_count
@@ -35,7 +34,6 @@ from flows.web import app_context, intake
 from flows.web.app_context import PageContext
 from flows.web.drafts import Drafts
 from flows.web.intake import NewDraft
-from worldpose.errors import InputError
 from worldpose.store.run_queue import queue_of
 from worldpose.store.runs import alone
 from worldpose.store.store import Store
@@ -218,26 +216,13 @@ def test_only_the_impatient_wait_for_a_shorter_time_beside_a_silent_disk(short):
     never.set()
 
 
-def test_a_match_on_a_silent_disk_delays_no_run_of_another(two, monkeypatch):
-    answers, opening = Event(), Event()
-
-    def wait(store, match_id):
-        opening.set()
-        answers.wait(30.0)
-        raise InputError(match_id, "an answer", "none", "Wait.")
-
+def test_a_match_is_opened_without_the_lock_of_all_runs(two, monkeypatch):
+    runs, free = app_context.Continuing(Store.open(two / "project")), []
+    opened = lambda *_: free.append(not runs._lock.locked()) or "m"  # noqa: E731
     monkeypatch.setattr(app_context, "has_server", lambda: True)
-    monkeypatch.setattr(app_context, "open_for_review", wait)
-    runs = app_context.Continuing(Store.open(two / "project"))
-    stuck, other = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
-    going_on = stuck.submit(runs.go_on, "first")
-    assert opening.wait(5.0)
-    try:
-        assert not other.submit(runs.cancel, "second").result(timeout=5.0)
-    finally:
-        answers.set()
-    with pytest.raises(InputError, match="an answer"):
-        going_on.result(timeout=5.0)
+    monkeypatch.setattr(app_context, "open_for_review", opened)
+    monkeypatch.setattr(app_context, "resume", lambda _, match: [match, str(runs._lock.locked())])
+    assert (runs.go_on("first")["how"], free) == ("resumed m, True", [True])
 
 
 @pytest.mark.timeout(120)
