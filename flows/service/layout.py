@@ -179,7 +179,7 @@ def disk_answers(path: Path) -> bool:
     A file is read, a folder is listed. The process that asks it is left behind: no signal ends one
     that waits for a disk.
     """
-    nothing, ask = subprocess.DEVNULL, ["sh", "-c", 'cat -- "$0"; ls -f -- "$0"', path]
+    nothing, ask = subprocess.DEVNULL, ["sh", "-c", 'cat -- "$0"; ls -f -- "$0"', str(path)]
     asking = subprocess.Popen(ask, stdin=nothing, stdout=nothing, stderr=nothing)
     try:
         asking.wait(DISK_SECONDS)

@@ -332,10 +332,10 @@ def _take_calibration(
 
     spec, left_out = read_spec(folder), LeftOut()
     sizes = image_sizes(spec)
-    sizes |= {new: sizes[own] for own, new in called.items() if own in sizes}
+    sizes |= {new: sizes[old] for old, new in called.items() if old in sizes}
     cameras = read_calibration(source, sizes, left_out, any_unit=True)
-    for own in [own for own, new in called.items() if own not in cameras and new in cameras]:
-        cameras[own] = cameras.pop(called[own]).model_copy(update={"id": own})
+    for old in [old for old, new in called.items() if old not in cameras and new in cameras]:
+        cameras[old] = cameras.pop(called[old]).model_copy(update={"id": old})
     known = {camera.id: camera for camera in spec.static_cameras if camera.id in cameras}
     if not known:
         raise InputError(

@@ -45,9 +45,14 @@ def test_the_inbox_and_a_page_name_cameras_by_one_rule_in_all_parts(at, tmp_path
         assert getattr(match.folder, part) == found, part
     content = yaml.safe_load((folder / "match.yaml").read_text()) | {"match_id": "n"}
     (tmp_path / "draft" / "match" / "videos").mkdir(parents=True)
-    shutil.move(folder, tmp_path / "draft" / "own")
+    shutil.move(folder, own := tmp_path / "draft" / "own")
+    text = (own / "reference" / "calibration.toml").read_text().replace("cam0", "stand-")
+    (tmp_path / "draft" / "given").mkdir()
+    (tmp_path / "draft" / "given" / "venue.toml").write_text(text)
     assert open_stored(store, "m").folder.detections.keys() == match.folder.detections.keys()
-    assert "cam00 is stand-0 at the venue" in build(store, content, tmp_path / "draft", {})[1]
+    _, notes = build(store, content, tmp_path / "draft", {})
+    assert f"calibration of {', '.join(OLD.values())}" in notes
+    assert "cam00 is stand-0 at the venue" in notes
 
 
 def test_an_import_states_its_venue_and_a_calibration_may_have_its_names(at, tmp_path):
