@@ -30,7 +30,7 @@ from flows.gates import GATES
 from flows.layers import PROJECT, VENUES, layer_path, match_layer, read_layer, read_layers
 from flows.match_state import MatchState, describe_problem, match_state
 from flows.method import METHOD
-from flows.patience import SILENT_SECONDS, read_in_time
+from flows.patience import SILENT_SECONDS, reach, read_in_time
 from flows.registering import open_for_review
 from flows.results.timings import Cost
 from flows.review.corrections import objections_of
@@ -100,6 +100,8 @@ def _read_summary(store: Store, match_id: str, known: list[MatchSummary]) -> Mat
         kept = None if data is None else unseal(MatchSummary, data, path)
         if kept and kept.match_id == match_id:
             known.append(kept)
+            for folder in [each for each in kept.watched if each.startswith("/")][:1]:
+                reach(folder)
             if kept.made_from == _basis(store, kept)[0]:
                 return kept
     return make_summary(store, match_id)
@@ -256,6 +258,7 @@ def _watch(store: Store, summary: MatchSummary) -> MatchSummary:
 def _files_of(registration: Registration) -> Iterator[str]:
     """Yield the match folder, its folders, and its files unless there are too many."""
     folder = Path(registration.folder)
+    reach(str(folder))
     yield str(folder)
     if folder.is_dir():
         yield from sorted(each.path for each in os.scandir(folder) if each.is_dir())

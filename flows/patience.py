@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, wait
 from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
+
+import psutil
 
 T = TypeVar("T")
 
@@ -17,6 +21,7 @@ SILENT_SECONDS: Final = 10.0
 SHORT_SECONDS: Final = 1.0
 """Wait of the impatient while another disk is silent: many matches can be on it."""
 MOST_SILENT: Final = 64  # then the impatient begin no other read
+MOST_OF_DISK: Final = 8  # silent reads of one disk: then no other one waits for it
 
 
 @dataclass
@@ -30,12 +35,19 @@ class _Late(Generic[T]):
     clock: Callable[[], float] | None = None
     """Processor time of its thread [s]: it stands still while the disk does not answer."""
     spent: float = 0.0
+    disk: str = ""
+    """Where its disk is mounted, as far as it is known."""
+    is_left: bool = False
+    """Whether it ended because too many reads wait for its disk already."""
     moved_at: float = field(default_factory=time.monotonic)
 
     def run(self, read: Callable[[list[T]], T]) -> None:
-        self.clock = clock_of_this_thread()
+        self.clock, _HERE.late = clock_of_this_thread(), self
         try:
             self.made.set_result(read(self.known))
+        except SilentDiskError:
+            self.is_left = True
+            self.made.set_result(self.known[-1])
         except Exception as error:
             self.made.set_exception(error)
 
@@ -49,6 +61,11 @@ class _Late(Generic[T]):
 
 LATE: Final[dict[str, _Late[Any]]] = {}
 _LOCK: Final = threading.Lock()
+_HERE: Final = threading.local()
+
+
+class SilentDiskError(Exception):
+    """A disk that is needed does not answer, or too many reads wait for it already."""
 
 
 def read_in_time(
@@ -81,7 +98,37 @@ def read_in_time(
             del LATE[place]
     if late.mark != mark:
         return read_in_time(place, mark, read, first, is_patient=is_patient)
-    return late.made.result(), False
+    return late.made.result(), late.is_left
+
+
+async def ask_disk(place: str, read: Callable[[], T]) -> T:
+    """Return what a read gives, or raise SilentDiskError: no loop or thread of a server waits."""
+    late = _Late[T](None, [])
+    with _LOCK:
+        asked = _ASKED[place] = [it for it in _ASKED.get(place, ()) if not it.made.done()]
+        if any(each.is_silent() for each in asked):
+            raise SilentDiskError
+        asked.append(late)
+    threading.Thread(target=late.run, args=[lambda _: read()], daemon=True).start()
+    await asyncio.wait([asyncio.wrap_future(late.made)], timeout=SILENT_SECONDS)
+    if not late.made.done():
+        raise SilentDiskError
+    return late.made.result()
+
+
+_ASKED: Final[dict[str, list[_Late[Any]]]] = {}
+
+
+def reach(path: str) -> None:
+    """Note in a read that it now asks the disk of a path; end it if many reads wait for that."""
+    if (late := getattr(_HERE, "late", None)) is None:
+        return
+    mounts = (each.mountpoint for each in psutil.disk_partitions(all=True))  # it asks no disk
+    late.disk = max(filter(Path(path).is_relative_to, mounts), key=len, default="")
+    with _LOCK:
+        silent = sum(each.disk == late.disk and each.is_silent() for each in LATE.values())
+    if silent >= MOST_OF_DISK:
+        raise SilentDiskError
 
 
 def clock_of_this_thread() -> Callable[[], float]:

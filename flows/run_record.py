@@ -72,6 +72,8 @@ def describe_end(record: RunRecord) -> str:
 LOG: Final = logging.getLogger("worldpose.operations")
 LOOK_SECONDS: Final = 1.0
 """Between two looks for the end of another run [s]."""
+MOST_SECONDS: Final = 86400.0
+"""Time after which a wait for another run of the match ends [s]."""
 CLOCK_SECONDS: Final = 5.0
 """Tolerance between the clocks of a process table and of records without `process` [s]."""
 
@@ -103,24 +105,32 @@ def alone_with(store: Store, match_id: str, *, wait: bool = False) -> Iterator[N
     """Hold a match, so that no other process of this machine runs it; or wait until none does.
 
     Every door that runs a match holds it, from before its settings are read to its record.
+
+    Raises:
+        AtWorkError: another process runs it, and this one does not wait, or has for `MOST_SECONDS`.
     """
-    said = LOG.info
+    said, begun = LOG.info, datetime.now(UTC)
+    end = time.monotonic() + MOST_SECONDS
     while True:  # not one long wait: a process that hangs uses no processor time
         with alone(store.blobs, f"match-{match_id}", wait=False) as is_held:
-            runs = runs_at_work(store, match_id) if is_held or not wait else ()
+            is_over = not wait or time.monotonic() >= end
+            runs = runs_at_work(store, match_id) if is_held or is_over else ()
             if is_held and not runs:
                 yield
                 return
-        if not wait:
+        if is_over:
             found = [
-                f"run {run.run_id}, process {run.pid}, since {run.started_at:%H:%M:%S} UTC"
+                f"run {run.run_id}, process {run.pid}, since {run.started_at:%Y-%m-%d %H:%M:%S} UTC"
                 for run in runs
             ]
+            other = "another process that runs it, perhaps elsewhere"
+            other += f", since before {begun:%Y-%m-%d %H:%M:%S} UTC" if wait else ""
             raise AtWorkError(
                 f"match {match_id}",
                 expected="no run of it at work",
-                found=found[0] if found else "another process that runs it, perhaps elsewhere",
-                todo="Wait for its end; or end that process: its finished results are kept.",
+                found=found[0] if found else other,
+                todo=f"Wait for its end; or end that process, which holds {store.url}/locks/match-"
+                f"{match_id}.lock: its finished results are kept.",
             )
         said("%s: another run of it is at work; this one continues after it", match_id)
         said = LOG.debug

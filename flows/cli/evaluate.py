@@ -17,6 +17,7 @@ from flows.cli.options import DEFAULT_PROJECT, given_options
 from worldpose.errors import UsageError
 
 if TYPE_CHECKING:
+    from flows.results.ablation import Score
     from flows.results.evaluation import Scores
 
 TableForm = Literal["text", "csv", "latex"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import re
+from contextlib import suppress
 from typing import Final
 from urllib.parse import quote
 
@@ -13,8 +14,9 @@ from starlette.responses import JSONResponse, RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from flows.orchestration.prefect_environment import authorization
+from flows.patience import SilentDiskError
 from flows.web.access import Access
-from flows.web.guard import LOG, OPEN, SAFE, identify
+from flows.web.guard import LOG, OPEN, SAFE, SILENT, identify_in_time
 from flows.web.host_guard import refusal
 from flows.web.sessions import login_app
 
@@ -61,7 +63,14 @@ class DashboardLogin:
         is_own = "origin" in headers or headers.get("sec-fetch-site") == "same-origin"
         is_page = method == "GET" and "text/html" in headers.get("accept", "")
         is_page = is_page and not BARE.fullmatch(scope["path"])
-        who, role, _, _ = identify(self.access, scope, headers)
+        try:
+            who, role, _, _ = await identify_in_time(self.access, scope, headers)
+        except SilentDiskError:
+            if method:
+                await refusal(503, SILENT)(scope, receive, send)
+            else:
+                await send({"type": "websocket.close", "code": 1013, "reason": SILENT[:100]})
+            return
         if method and scope["path"] in self.form_paths:
             await self.form(scope, receive, send)
         elif who is not None and role == "approver" and (is_own or method in SAFE):
@@ -111,14 +120,19 @@ class DashboardLogin:
 
     async def _stream(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a WebSocket on, with the login in its first message, while the session lasts."""
-        is_first = True
+        is_first, headers = True, Headers(scope=scope)
 
         async def read() -> Message:
             nonlocal is_first
             message = await receive()
             if message["type"] == "websocket.receive" and is_first:
                 is_first = False
-                said = json.loads(message.get("text") or "null")
+                try:
+                    said = json.loads(message.get("text") or "null")
+                except (ValueError, RecursionError):
+                    why = "expected JSON in the first message, found other text"
+                    await send({"type": "websocket.close", "code": 1007, "reason": why})
+                    return {"type": "websocket.disconnect", "code": 1007}
                 if isinstance(said, dict) and said.get("type") == "auth":
                     message = {**message, "text": json.dumps({**said, "token": self.login})}
             return message
@@ -126,7 +140,9 @@ class DashboardLogin:
         stream = asyncio.ensure_future(self.app(scope, read, send))
         try:
             while not (await asyncio.wait({stream}, timeout=CHECK_SECONDS))[0]:
-                who, role, _, _ = identify(self.access, scope, Headers(scope=scope))
+                who, role = None, None  # also if nobody can say whether the session has ended
+                with suppress(SilentDiskError):
+                    who, role, _, _ = await identify_in_time(self.access, scope, headers)
                 if who is None or role != "approver":
                     stream.cancel()
                     await asyncio.wait({stream})

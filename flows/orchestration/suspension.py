@@ -55,11 +55,12 @@ def take_verdict(store: Store, match_id: str, waiting: Sequence[WaitingUnit]) ->
         WorldposeError: resumed with `recorded` though nothing was decided.
         prefect.exceptions.Pause: not answered yet; this ends the process.
     """
+    asked = sorted(unit.request for unit in waiting)
     lines = [f"- `{unit.request}`: {all_reasons(unit.reasons)}" for unit in waiting]
     text = "\n".join([f"{len(waiting)} results of {match_id} wait for review:", *lines])
     answer = suspend_flow_run(
         wait_for_input=Verdict.with_initial_data(description=text),
-        key=question_key(waiting),
+        key=f"review-{digest(canonical_json(asked))[:16]}",  # the same for the same results
         timeout=int(PATIENCE.total_seconds()),
     )
     if answer.verdict == "recorded":
@@ -128,9 +129,3 @@ def resume_suspended(project: str, match_id: str) -> list[str]:
             "equally well."
         )
     return resumed
-
-
-def question_key(waiting: Sequence[WaitingUnit]) -> str:
-    """Return the key of a question: the same for the same waiting results."""
-    asked = sorted(unit.request for unit in waiting)
-    return f"review-{digest(canonical_json(asked))[:16]}"

@@ -13,7 +13,7 @@ from data_contracts.run import RunRecord
 from flows.layers import add_venue, read_layers
 from flows.review.detections import objections_in, replay_objections, require_seen
 from flows.review.edit_conflicts import StaleEditError
-from flows.review.identities import identity_objections, lost_names, require_fitting
+from flows.review.identities import identity_objections, lost_names, once, require_fitting
 from flows.stage import Match
 from worldpose.errors import InputError, StoreError
 from worldpose.ingest.match_folder import MatchFolder
@@ -93,41 +93,23 @@ def objections_now(store: Store, match: Match, latest: RunRecord | None) -> dict
         if isinstance(each.edit, (*IDENTITY_EDITS, *DETECTION_EDITS)):
             key = owner_of(each.edit), isinstance(each.edit, IDENTITY_EDITS)
             made.setdefault(key, []).append(each)
-    kept = _TOLD.setdefault(store, {})
-    before, told = kept.pop(match.match_id, (latest.results, {}))
-    told = told if before == latest.results else {}
-    kept[match.match_id] = (latest.results, told)
-    while len(kept) > MOST_KEPT:
-        kept.pop(next(iter(kept)), None)
-    for place, corrections in made.items():
-        owner, is_clip = place
-        ids = tuple(each.id for each in corrections)
-        if place not in told or told[place][0] != ids:
-            replay = identity_objections if is_clip else replay_objections
-            try:
-                told[place] = ids, replay(store, match, owner)
-            except (InputError, StoreError):  # nothing is replayed before the next run: it says why
-                continue
-        for number, why in told[place][1].items():
+    for (owner, is_clip), corrections in made.items():
+        replay = identity_objections if is_clip else replay_objections
+        try:
+            told = once(
+                (store, f"{match.match_id}/{owner} {is_clip}", 1000),
+                (latest.results, [each.id for each in corrections]),
+                lambda: replay(store, match, owner),  # noqa: B023
+            )
+        except (InputError, StoreError):  # nothing is replayed before the next run: it says why
+            continue
+        for number, why in told.items():
             each = corrections[number]
             if not isinstance(each.edit, NamedTrack):
                 found |= {each.id: why} if why else {}
             elif why is None:  # a correction since the run made the person
                 found.pop(each.id, None)
     return found
-
-
-_TOLD: WeakKeyDictionary[
-    Store,
-    dict[
-        str,
-        tuple[
-            Mapping[str, str],
-            dict[tuple[str, bool], tuple[tuple[str, ...], dict[int, str | None]]],
-        ],
-    ],
-] = WeakKeyDictionary()
-"""Match to the latest results and, by camera or clip, corrections in force and their objections."""
 
 
 def new_corrections(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
+from typing import Any, TypeVar
+from weakref import WeakKeyDictionary
 
 from pydantic import JsonValue
 
@@ -28,8 +30,10 @@ from worldpose.review.identities import (
     replay_identities,
     stored_identities,
 )
-from worldpose.review.journal import Journal, read_journal
+from worldpose.review.journal import MOST_KEPT, Journal, read_journal
 from worldpose.store.store import Run, Store
+
+T = TypeVar("T")
 
 
 def said_of(match: Match, clip: str) -> list[IdentityEdit]:
@@ -60,7 +64,29 @@ def identities_now(
     assert isinstance(taken, list)  # corrections as JSON
     as_json = [edit.model_dump(mode="json") for edit in moves[: len(taken)]]
     in_run = len(taken) if as_json == taken else 0  # some can be withdrawn
-    return _replay(stored, said, stated, in_run, with_joints=with_joints)
+    return once(
+        (store, f"{match_id}/{clip} {with_joints}", 2),
+        (results[name], stored.edits, said, stated),
+        lambda: _replay(stored, said, stated, in_run, with_joints=with_joints),
+    )
+
+
+def once(kept_as: tuple[Store, str, int], state: object, make: Callable[[], T]) -> T:
+    """Return what is made of a state, or was made of it before.
+
+    `kept_as` has the store, the place, and how many places with this number are kept.
+    """
+    store, place, most = kept_as
+    kept = _MADE.setdefault(store, {}).setdefault(most, {})
+    before, made = kept.pop(place, (None, None))
+    made = made if made is not None and before == state else make()
+    kept[place] = state, made
+    while len(kept) > most:
+        kept.pop(next(iter(kept)), None)
+    return made
+
+
+_MADE: WeakKeyDictionary[Store, dict[int, dict[str, tuple[object, Any]]]] = WeakKeyDictionary()
 
 
 def identity_objections(store: Store, match: Match, clip: str) -> dict[int, str | None]:
@@ -145,7 +171,11 @@ def _replay_names(run: Run, clip: str) -> tuple[dict[str, str], dict[int, str]]:
     assert isinstance(moves, list)
     said = _said_in(journal, clip, moves)
     stored = open_stored(run.store, run.record, unit, "identities")
-    replay = _replay(stored, [*said.values()], stated, len(moves), with_joints=False)
+    replay = once(
+        (run.store, f"{match_id}/{run.record.run_id}/{clip}", MOST_KEPT),
+        (run.record.results[unit], stored.edits, said, stated),
+        lambda: _replay(stored, [*said.values()], stated, len(moves), with_joints=False),
+    )
     ids, names = replay.identities.person.tolist(), replay.identities.names
     lost |= {
         name: f"{edit.name!r} names no person: {why}. Name the person again, or withdraw the name"

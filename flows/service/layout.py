@@ -176,10 +176,11 @@ def served_state(url: str) -> StateFolder:
 def disk_answers(path: Path) -> bool:
     """Return whether the disk of a path answers in time; an error is an answer too.
 
-    The process that asks it is left behind: no signal ends one that waits for a disk.
+    A file is read, a folder is listed. The process that asks it is left behind: no signal ends one
+    that waits for a disk.
     """
-    nothing = subprocess.DEVNULL
-    asking = subprocess.Popen(["cat", path], stdin=nothing, stdout=nothing, stderr=nothing)
+    nothing, ask = subprocess.DEVNULL, ["sh", "-c", 'cat -- "$0"; ls -f -- "$0"', str(path)]
+    asking = subprocess.Popen(ask, stdin=nothing, stdout=nothing, stderr=nothing)
     try:
         asking.wait(DISK_SECONDS)
     except subprocess.TimeoutExpired:

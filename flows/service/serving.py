@@ -207,10 +207,8 @@ def serve(plan: ServePlan, secrets: Secrets, ready: Callable[[], None], tell: Te
 
 
 def _require_free_ports(plan: ServePlan) -> None:
-    ports = {
-        "--port": (plan.host, plan.pages_port),
-        "--metrics-port": (plan.host, plan.metrics_port),
-    }
+    numbers = {"--port": plan.pages_port, "--metrics-port": plan.metrics_port}
+    ports = {option: (plan.host, number) for option, number in numbers.items()}
     if plan.owns_prefect:
         address = urlsplit(plan.prefect)
         ports["--prefect-port"] = (address.hostname or "127.0.0.1", address.port or 80)

@@ -69,7 +69,8 @@ def create_app(project: str, access: Access, intake: Intake | None = None) -> Fa
     for with_inbox in (routes_of_intake, offsets.routes):
         app.include_router(with_inbox(context, intake))
     app.include_router(_files())
-    app.add_middleware(Guard, access=access)
+    url = context.store.url
+    app.add_middleware(Guard, access=access, disk=None if "://" in url else Path(url))
     return app
 
 
@@ -118,11 +119,11 @@ def _sessions(context: PageContext, intake: Intake | None) -> APIRouter:
     access = context.access
 
     @router.get("/api/health")
-    def health() -> dict[str, str]:
+    async def health() -> dict[str, str]:
         return {"state": "up"}
 
     @router.get("/api/session")
-    def session(request: Request, who: Person) -> dict[str, str | bool]:
+    async def session(request: Request, who: Person) -> dict[str, str | bool]:
         return {
             "who": who,
             "role": request.state.role,

@@ -113,7 +113,7 @@ class PageContext:
         return match, asked
 
 
-def _person(request: Request) -> str:
+async def _person(request: Request) -> str:
     return str(request.state.who)
 
 
@@ -157,17 +157,30 @@ class Continuing:
             InputError: a suspended run has undecided reviews.
             UnreachablePrefectError: Prefect does not answer.
         """
+        match: Match | None = None
+        while (found := self._go_on(match_id, gates, match)) is None:
+            match = open_for_review(self.store, match_id)  # unlocked: its disk can be silent
+        return found
+
+    def _go_on(
+        self, match_id: str, gates: str | None, match: Match | None
+    ) -> dict[str, Any] | None:
+        """Do as `go_on` with the opened match; return None where it is needed and not given."""
         with self._lock:
             served = match_runs_of(self.store.url)
             if served is None:
-                resumed = self._resume(match_id) if has_server() else None
+                if has_server() and not match:
+                    return None
+                resumed = self._resume(match) if match else None
                 return resumed or self._local.go_on(match_id, gates)
             own = _open_runs(served, match_id)
             states, self._seen = {run.state for run in own}, None
             # The process of a run that was suspended a moment ago ends its workers first.
             kinds = {run["state_type"] for run in served.at_prefect(own).values()}
             is_suspended = "waiting" in states or "PAUSED" in kinds
-            if is_suspended and (resumed := self._resume(match_id)):
+            if is_suspended and not match:
+                return None
+            if is_suspended and match and (resumed := self._resume(match)):
                 for run in own:
                     if run.state == "waiting":
                         served.queue.change(run, "asked", "resumed")
@@ -180,9 +193,9 @@ class Continuing:
             how = "once more when the run at work has ended" if states else "the deployment"
             return {"state": "running", "how": how, "prefect": served.link(run)}
 
-    def _resume(self, match_id: str) -> dict[str, Any] | None:
+    def _resume(self, match: Match) -> dict[str, Any] | None:
         """Resume the match's suspended runs; return None if there are none."""
-        resumed = resume(self.store, open_for_review(self.store, match_id))
+        resumed = resume(self.store, match)
         return {"state": "resumed", "how": f"resumed {', '.join(resumed)}"} if resumed else None
 
     def cancel(self, match_id: str) -> bool:

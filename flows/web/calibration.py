@@ -175,13 +175,13 @@ def _describe(context: PageContext, match: Match, owner: str, frame: int | None)
     clicked = _read_clicks(match, owner, frame)
     latest = latest_run(context.store, match.match_id)
     stage = "static_calibration" if frame is None else "broadcast_calibration"
-    unit = f"{stage}/{owner}"
+    unit, spec = f"{stage}/{owner}", match.folder.spec.filming_camera(owner)
     return {
         "match": match.match_id,
         "owner": owner,
         "frame": frame,
         "given": owner in match.folder.calibrations,
-        "side": _stated_side(match, owner),
+        "side": None if spec is None else spec.side,
         "has_picture": owner in match.folder.stills or owner in match.folder.videos,
         "points": {point.name: point.xy for point in clicked.points},
         "drawn": {marking.name: marking.xy for marking in clicked.drawn},
@@ -295,12 +295,6 @@ def _pitch(drawing: PitchDrawing) -> dict[str, Any]:
         "points": {name: _round_numbers(place, 3) for name, place in template.points.items()},
         "markings": {name: _round_numbers(line, 2) for name, line in drawing.markings.items()},
     }
-
-
-def _stated_side(match: Match, owner: str) -> str | None:
-    """Return the side of a static camera or a broadcast view, if it is stated."""
-    camera = match.folder.spec.filming_camera(owner)
-    return None if camera is None else camera.side
 
 
 def _round_pieces(markings: Mapping[str, list[NDArray[np.float64]]]) -> dict[str, Any]:

@@ -292,11 +292,6 @@ def _adjustment(store: Store, run: Run, match: Match, unit: str) -> Evidence:
     return Evidence(tuple(pictures), tuple(adjustment_tables(run)[:1]))
 
 
-def _broadcast(store: Store, run: Run, match: Match, view: str) -> Evidence:
-    pictures, tables = broadcast_pictures(run, match, view), broadcast_tables(run, match, view)
-    return Evidence(tuple(pictures), tuple(tables))
-
-
 def _people(store: Store, run: Run, match: Match, unit: str) -> Evidence:
     """Draw the boxes in the frames with the fewest, a middling and the largest number of people."""
     import cv2  # imported here: few pages decode an image
@@ -329,7 +324,9 @@ _DRAWN: Final[dict[str, Callable[[Store, Run, Match, str], Evidence]]] = {
     "triangulation": _clip,
     "bundle_adjustment": _adjustment,
     "body_fitting": _acceptance,
-    "broadcast_calibration": _broadcast,
+    "broadcast_calibration": lambda _, run, match, view: Evidence(
+        tuple(broadcast_pictures(run, match, view)), tuple(broadcast_tables(run, match, view))
+    ),
 }
 
 

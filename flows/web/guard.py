@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import logging
+from contextlib import suppress
 from http.cookies import CookieError, SimpleCookie
-from typing import Final
+from pathlib import Path
+from typing import Final, TypeAlias
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from flows.patience import SilentDiskError, ask_disk
 from flows.web.access import LOOPBACK, SESSION_SECONDS, Access
 from flows.web.host_guard import host_name, refusal, refuse_foreign
 from flows.web.proxy import Role, Visitor
@@ -28,6 +31,9 @@ CHUNK_SUFFIX: Final = "/bytes"
 SAFE: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 HSTS_SECONDS: Final = 365 * 86400
 """Time for which browsers then reach this name by TLS alone."""
+SILENT: Final = (
+    "the disk of the project does not answer: its operator must look after it, or the network to it"
+)
 ASKING: Final = "/preview"
 """Suffix of paths that are posted to with every mouse move, and change nothing."""
 POLICY: Final = (
@@ -38,9 +44,10 @@ POLICY: Final = (
 """Content that a page can load: scripts, styles, images, videos of this server; nothing inline."""
 
 
-def identify(
-    access: Access, scope: Scope, headers: Headers
-) -> tuple[str | None, Role | None, str | None, Visitor | None]:
+Identity: TypeAlias = tuple[str | None, Role | None, str | None, Visitor | None]
+
+
+def identify(access: Access, scope: Scope, headers: Headers) -> Identity:
     """Return person, role and session of a request, and the visitor whom a proxy has logged in.
 
     The person is None without a valid session; the role is None if no group of a visitor has one.
@@ -52,9 +59,33 @@ def identify(
     session = None if found is None else found.value
     visitor = None if access.proxy is None else access.proxy.visitor(scope, headers)
     if visitor is not None:
-        return visitor.who, visitor.role, session, visitor
+        is_own = access.person(session, by_proxy=True) == visitor.who
+        return visitor.who, visitor.role, session if is_own else None, visitor
     who = access.person(session)
     return who, access.role(who), session, None
+
+
+async def identify_in_time(
+    access: Access, scope: Scope, headers: Headers, disk: Path | None = None
+) -> Identity:
+    """Do as `identify`; the files of the log-in form need no session.
+
+    Raises:
+        SilentDiskError: the disk of the project, or of ended sessions, does not answer.
+    """
+    is_open = scope["path"] in OPEN and scope.get("method") in SAFE
+    if is_open and access.proxy is None:
+        headers = Headers(raw=[each for each in headers.raw if each[0] != b"cookie"])
+    sessions = access.ended if "cookie" in headers else None
+
+    def look() -> Identity:
+        if disk is not None and not is_open:
+            with suppress(OSError):  # an error is an answer
+                next(disk.iterdir(), None)
+        return identify(access, scope, headers)
+
+    place = sessions if is_open else disk or sessions
+    return look() if place is None else await ask_disk(str(place), look)
 
 
 def set_session(answer: Response, access: Access, session: str, secure: bool) -> None:
@@ -76,11 +107,11 @@ class Guard:
         one; a person whom a trusted proxy names gets one. Changes: need the session's form secret,
         and this origin if the browser states one. Size: at most `BODY_BYTES`, or `CHUNK_BYTES` of
         a chunk of a file. Every login and every requested change is logged with person, request
-        and response.
+        and response. Disk: while that of the project is silent, all but the form gets 503.
     """
 
-    def __init__(self, app: ASGIApp, access: Access) -> None:
-        self.app, self.access = app, access
+    def __init__(self, app: ASGIApp, access: Access, disk: Path | None = None) -> None:
+        self.app, self.access, self.disk = app, access, disk
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send the refusal, or pass the request on with person, role and session in `state`."""
@@ -91,9 +122,15 @@ class Guard:
             raise RuntimeError(f"nothing here speaks {scope['type']}")
         headers = Headers(scope=scope)
         access = self.access
-        who, role, session, visitor = identify(access, scope, headers)
+        found: Identity = (None, None, None, None)
+        refused: Response | None = None
+        try:
+            found = await identify_in_time(access, scope, headers, self.disk)
+        except SilentDiskError:
+            refused = refusal(503, SILENT)
+        who, role, session, visitor = found
         begun = Response()  # a session that begins with this request
-        if visitor is not None and access.person(session, by_proxy=True) != who:
+        if visitor is not None and session is None:
             session = access.session(visitor.who, by_proxy=True)
             set_session(begun, access, session, access.secure or visitor.secure)
         state = scope.setdefault("state", {})
@@ -126,9 +163,9 @@ class Guard:
                     LOG.info("%s: %r: %s", state["who"] or "nobody", place, message["status"])
             await send(message)
 
-        refusal = self._refusal(scope, headers)
-        if refusal is not None:
-            await refusal(scope, receive_noted, send_sealed)
+        refused = refused or self._refusal(scope, headers)
+        if refused is not None:
+            await refused(scope, receive_noted, send_sealed)
             return
         await self.app(scope, receive_noted, send_sealed)
 

@@ -16,6 +16,7 @@ from data_contracts.records import Name, Record
 from data_contracts.run import RunRecord
 from flows.match_state import corrections_since
 from flows.results.comparison import compare_runs
+from flows.settings import flatten
 from flows.stage import Match
 from flows.web.app_context import PageContext, Person
 from flows.web.images import image_response
@@ -55,7 +56,10 @@ def routes(context: PageContext) -> APIRouter:
                 "seconds": record.seconds,
                 "computed": len(record.executed),
                 "failed": [each.unit for each in record.failed],
-                "settings": _list_settings(record),
+                "settings": [
+                    *(f"{name} = {value}" for name, value in flatten(record.overrides).items()),
+                    f"gates = {record.gates}",
+                ],
                 "cause": _find_cause(match, record, records.get(record.parent or "")),
                 "pins": [pin.name for pin in pins if pin.run_id == run_id],
             }
@@ -120,12 +124,6 @@ def _find_run(store: Store, match_id: str, run_id: str) -> RunRecord:
     if run_id not in store.runs(match_id):
         raise HTTPException(404, "no such run")
     return store.run(match_id, run_id)
-
-
-def _list_settings(record: RunRecord) -> list[str]:
-    given = [(stage, item) for stage, items in record.overrides.items() for item in items.items()]
-    changed = [f"{stage}.{name} = {value}" for stage, (name, value) in given]
-    return [*changed, f"gates = {record.gates}"]
 
 
 def _find_cause(match: Match, record: RunRecord, parent: RunRecord | None) -> str:

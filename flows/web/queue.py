@@ -11,7 +11,6 @@ from typing import Any, Final
 from fastapi import APIRouter
 
 from data_contracts.operations import MatchSummary
-from data_contracts.review import ReviewRequest
 from data_contracts.static_calibration import ClickedMarkings
 from flows.gates import GATES
 from flows.method import METHOD
@@ -138,8 +137,9 @@ def _kind(match: MatchSummary, running: Container[str]) -> str:
 
 def describe_review(review: Review) -> dict[str, Any]:
     """Return one review request as JSON for the pages."""
-    (unit,) = review.request.keys
-    return {**review_json(review), "unit": unit, "excess": _excess(review.request)}
+    (unit,), gate = review.request.keys, GATES.get(review.request.gate)
+    excess = 0.0 if gate is None else gate.excess(review.request.figures)
+    return {**review_json(review), "unit": unit, "excess": excess}
 
 
 def _glance(context: PageContext, found: MatchSummary) -> dict[str, Any]:
@@ -218,11 +218,6 @@ def _clip(context: PageContext, match: Match, clip: str) -> dict[str, Any]:
         "pick_next": pick_next,
         "has_tracks": latest is not None and f"tracking/{clip}" in latest.results,
     }
-
-
-def _excess(request: ReviewRequest) -> float:
-    gate = GATES.get(request.gate)
-    return 0.0 if gate is None else gate.excess(request.figures)
 
 
 def _clicks(match: Match, camera: str) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from typing import Final
@@ -51,7 +51,7 @@ def login_app(access: Access) -> ASGIApp:
     app.include_router(login_routes(access))
 
     @app.get("/api/session")
-    def session(request: Request) -> JSONResponse:
+    async def session(request: Request) -> JSONResponse:
         secret = access.form_secret(request.state.session)
         # Whom the other server refuses keeps the form, and can log out or in as another person.
         status = 200 if request.state.role == "approver" else 401
@@ -61,13 +61,13 @@ def login_app(access: Access) -> ASGIApp:
 
 
 def login_routes(access: Access) -> APIRouter:
-    """Create the routes that begin and end sessions, and the files of the form."""
+    """Create the routes of sessions and of the form: no log-in needs a thread, as a disk's do."""
     folder = files("flows.web") / "login"
     parts = {f"/login/{name}": folder / name for name in ("page.js", "page.css")}
     router = file_routes({"/login": folder / "page.html", **parts})
 
     @router.post("/api/login")
-    def login(given: Login, request: Request) -> JSONResponse:
+    async def login(given: Login, request: Request) -> JSONResponse:
         guesser = access.guesser(given.who, request.cookies.get(f"{access.cookie}_known"))
         if not access.may_try(guesser):
             return JSONResponse(
@@ -111,10 +111,10 @@ def file_routes(served: Mapping[str, Traversable]) -> APIRouter:
     return router
 
 
-def _answer(name: str, content: bytes) -> Callable[[], Response]:
+def _answer(name: str, content: bytes) -> Callable[[], Awaitable[Response]]:
     kind = TYPES[name.rpartition(".")[2]]
 
-    def answer() -> Response:
+    async def answer() -> Response:
         return Response(content, media_type=kind, headers={"cache-control": "no-cache"})
 
     return answer

@@ -9,6 +9,7 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 from page_client import TOKEN, TestClient
 from starlette.responses import Response
+from starlette.websockets import WebSocketDisconnect
 
 from flows.orchestration.dashboard_login import DashboardLogin
 from flows.web.access import access_for
@@ -93,6 +94,23 @@ def test_of_the_dashboards_settings_only_a_good_answer_is_changed(access):
         ada = browser(access, "Ada", Response(said, status))
         answer = ada.request(method, "/ui-settings", headers={"origin": PORT})
         assert (answer.status_code, answer.content) == (status, expected), (method, status)
+
+
+def test_a_websocket_whose_first_message_is_not_json_is_closed_with_the_reason(access):
+    async def stream(scope, receive, send):
+        await receive()
+        await send({"type": "websocket.accept"})
+        while (await receive())["type"] != "websocket.disconnect":
+            await send({"type": "websocket.send", "text": "heard"})
+
+    with (
+        browser(access, "Ada", stream).websocket_connect("/api/ws", headers={"origin": PORT}) as it,
+        pytest.raises(WebSocketDisconnect) as closed,
+    ):
+        it.send_text("auth: me")
+        it.receive_text()
+    assert closed.value.code == 1007
+    assert closed.value.reason == "expected JSON in the first message, found other text"
 
 
 @pytest.mark.parametrize("asked", ["/runs", "/runs/a%2Fb", "/x%3Fq?tab=a%26b&c", "/%ff", "/a%25b"])

@@ -152,6 +152,32 @@ def test_objections_are_replayed_once_for_results_and_corrections(monkeypatch):
     assert corrections.objections_now(store, match, None) == {}
 
 
+def test_corrections_are_replayed_once_until_another_one_or_another_result(monkeypatch):
+    class Run(dict):
+        """A run, and its store."""
+
+        record = SimpleNamespace(match_id="m", run_id="0001", results={})
+        __hash__ = object.__hash__
+        run = runs = lambda self, _: self.record
+        registration = lambda self, _: None  # noqa: E731
+        has = lambda self, *_: True  # noqa: E731
+        manifest = lambda self, *_: SimpleNamespace(recipe=SimpleNamespace(sources={}))  # noqa: E731
+
+    run, real, made = Run({"tracking/clip": None}), identities._replay, []
+    run.store = run
+    monkeypatch.setattr(identities, "_replay", lambda *a, **k: made.append(a) or real(*a, **k))
+    monkeypatch.setattr(identities, "open_stored", lambda *_: StoredResult(tracks(), "k", []))
+    first, later = {"a": named(0, "Al"), "b": named(7, "Bo")}, {"c": named(1, "Cy")}
+    for count, key, said in ((2, "k", first), (4, "k", first | later), (6, "l", first | later)):
+        run.record.results["tracking/clip"] = key
+        monkeypatch.setattr(identities, "read_journal", lambda *_, said=said: journal(said))
+        match = SimpleNamespace(match_id="m", corrections=journal(said).standing.values())
+        for _ in range(3):
+            assert [*identities.lost_names(run)] == ["b"]
+            now = identities.identities_now(run, match, "clip", with_joints=False).identities
+        assert (len(made), len(now.names)) == (count, 1 + ("c" in said))
+
+
 def journal(said, withdrawn=()):
     """A journal of corrections by id, some of which were withdrawn."""
     made = {name: correction(edit, name) for name, edit in said.items()}

@@ -8,23 +8,24 @@ import signal
 import subprocess
 import sys
 from datetime import UTC, datetime
+from types import SimpleNamespace
 
 import pytest
 from command_line import TINY, WORLDPOSE, succeed, worldpose
 from rich.console import Console
 
 from data_contracts.review import DeletedDetection
-from flows import progress
+from flows import progress, run_record
 from flows.cli import console
 from flows.match_state import match_state
 from flows.progress import Reporter
 from flows.registering import open_match
 from flows.review.verdicts import correct
 from flows.run_plan import plan_run
-from flows.run_record import UNIT_SECONDS, alone_with, expected_work, latest_run
+from flows.run_record import UNIT_SECONDS, AtWorkError, alone_with, expected_work, latest_run
 from flows.web.app_context import read_progress
 from worldpose.store.documents import seal
-from worldpose.store.runs import identify_process
+from worldpose.store.runs import alone, identify_process
 from worldpose.store.store import Store
 
 
@@ -113,6 +114,20 @@ def test_a_second_run_of_a_match_at_work_is_refused_at_once(project_copy):
         other.communicate(b"\n")
     with alone_with(store, TINY):
         pass  # its process has ended
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("is_known", [False, True])
+def test_a_wait_for_another_run_ends_and_names_who_runs_it(is_known, tmp_path, monkeypatch):
+    store, since = Store.create(tmp_path / "project"), datetime(2026, 1, 2, 3, 4, tzinfo=UTC)
+    others = (SimpleNamespace(run_id="0003", pid=7, started_at=since),) * is_known
+    monkeypatch.setattr(run_record, "MOST_SECONDS", 0.1, raising=False)
+    monkeypatch.setattr(run_record, "LOOK_SECONDS", 0.02)
+    monkeypatch.setattr(run_record, "runs_at_work", lambda *_: others)
+    said = r"0003, process 7, since 2026-01-02 03:04:00 UTC" if is_known else r"since before 2.*UTC"
+    wait = alone_with(store, "m", wait=True)
+    with alone(store.blobs, "match-m", wait=False), pytest.raises(AtWorkError, match=said):
+        wait.__enter__()
 
 
 def test_ctrl_c_says_what_is_kept_and_leaves_neither_warning_nor_traceback(server, tiny, tmp_path):

@@ -153,6 +153,18 @@ def test_a_command_says_that_the_disk_of_its_project_does_not_answer(
     os.close(os.open(file, os.O_RDWR))
 
 
+def test_a_folder_that_cannot_be_listed_does_not_answer(monkeypatch, tmp_path):
+    assert layout.disk_answers(tmp_path)
+    gate = tmp_path / "gate"
+    os.mkfifo(gate)  # without a writer
+    (tmp_path / "ls").write_text(f"#!/bin/sh\nread line < {gate}\n")
+    (tmp_path / "ls").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    monkeypatch.setattr(layout, "DISK_SECONDS", 0.5)
+    assert not layout.disk_answers(tmp_path)
+    os.close(os.open(gate, os.O_RDWR))
+
+
 def test_no_lock_is_made_where_no_disk_is_mounted(state, tmp_path):
     with pytest.raises(FileNotFoundError), state.only_one("versions", wait=True):
         pass

@@ -5,28 +5,32 @@ import os
 import re
 import shutil
 import time
+from dataclasses import replace
 from datetime import UTC, datetime
-from pathlib import Path
 from threading import Event, active_count
 from types import SimpleNamespace
 
 import pytest
 from command_line import worldpose
 from fastapi import HTTPException
-from page_client import log_in, served
+from page_client import HERE, TOKEN, TestClient, browser, log_in, served
 from service import wait_until
+from stalled_disk import stalled
+from starlette.responses import Response
 
 from data_contracts.operations import MatchSummary, QueuedRun
 from flows import patience, reprocess, running
 from flows.layers import SETTINGS_LOCK, read_layers
+from flows.orchestration.dashboard_login import DashboardLogin
 from flows.overview import Overview, read_summary
 from flows.registering import open_match, register
 from flows.results import best_results
 from flows.running import RunRequest
 from flows.service import watching
 from flows.service.alerts import AlertDispatcher, kept_alerts
+from flows.service.layout import StateFolder
 from flows.service.plan import ServePlan
-from flows.web import intake
+from flows.web import app_context, intake
 from flows.web.app_context import PageContext
 from flows.web.drafts import Drafts
 from flows.web.intake import NewDraft
@@ -40,13 +44,17 @@ def two(small_match, tmp_path):
     """A project of two matches, `first` and `second`, and their folders next to it."""
     store = Store.create(tmp_path / "project")
     for number, name in enumerate(("first", "second")):
-        folder = Path(shutil.copytree(small_match, tmp_path / name))
-        text = (folder / "match.yaml").read_text()
-        (folder / "match.yaml").write_text(re.sub("match_id: .*", f"match_id: {name}", text))
-        file = folder / "pitch.json"
-        file.write_text(file.read_text() + "\n" * number)  # another match has other content
-        register(store, folder)
+        _register(store, small_match, tmp_path / name, number)
     return tmp_path
+
+
+def _register(store, origin, folder, number):
+    shutil.copytree(origin, folder)
+    text = (folder / "match.yaml").read_text()
+    (folder / "match.yaml").write_text(re.sub("match_id: .*", f"match_id: {folder.name}", text))
+    file = folder / "pitch.json"
+    file.write_text(file.read_text() + "\n" * number)  # another match has other content
+    register(store, folder)
 
 
 @pytest.fixture
@@ -206,6 +214,56 @@ def test_only_the_impatient_wait_for_a_shorter_time_beside_a_silent_disk(short):
     assert patience.read_in_time("b", 0, _answers(9), "first", is_patient=False) == ("first", False)
     assert time.monotonic() - begun < 0.4
     never.set()
+
+
+def test_a_match_is_opened_without_the_lock_of_all_runs(two, monkeypatch):
+    runs, free = app_context.Continuing(Store.open(two / "project")), []
+    opened = lambda *_: free.append(not runs._lock.locked()) or "m"  # noqa: E731
+    monkeypatch.setattr(app_context, "has_server", lambda: True)
+    monkeypatch.setattr(app_context, "open_for_review", opened)
+    monkeypatch.setattr(app_context, "resume", lambda _, match: [match, str(runs._lock.locked())])
+    assert (runs.go_on("first")["how"], free) == ("resumed m, True", [True])
+
+
+@pytest.mark.timeout(120)
+def test_a_dead_disk_of_many_matches_leaves_reads_to_other_disks(
+    two, small_match, short, monkeypatch
+):
+    monkeypatch.setattr(patience, "MOST_SILENT", 3)
+    monkeypatch.setattr(patience, "MOST_OF_DISK", 2, raising=False)
+    store, dead = Store.open(two / "project"), [f"dead{n}" for n in range(4)]
+    for number, name in enumerate(dead, 2):
+        _register(store, small_match, two / "disk" / name, number)
+    seen = Overview(store)
+    with stalled(two / "disk"):
+        for name in dead:
+            seen.read(name)
+            time.sleep(0.6)
+        assert sum(not each.made.done() for each in patience.LATE.values()) == 2
+        wait_until(lambda: not seen.read("second").is_unseen)
+        assert seen.read(dead[-1]).is_silent
+    wait_until(lambda: not (now := seen.read(dead[-1])).is_silent and not now.problem)
+
+
+@pytest.mark.timeout(120)
+def test_a_log_in_says_that_the_disk_of_the_project_does_not_answer(two, monkeypatch):
+    monkeypatch.setattr(patience, "SILENT_SECONDS", 0.5)
+    app = served(two / "project")
+    ada, new, given = log_in(app, "Ada"), browser(app), {"who": "Bo", "token": TOKEN}
+    sessions = StateFolder(two / "project" / "operations").ended_sessions
+    access = replace(app.state.access, ended=sessions)
+    prefect = TestClient(DashboardLogin(Response("of Prefect"), access, "a:b"), base_url=HERE)
+    prefect.cookies = ada.cookies
+    with stalled(two / "project"):
+        for _ in range(3):
+            for answer in (new.post("/api/login", json=given), ada.get("/api/matches")):
+                assert answer.status_code == 503
+                assert "the disk of the project does not answer" in answer.json()["error"]
+            assert prefect.get("/api/flows").status_code == 503
+        for path in ("/login", "/login/page.js", "/api/health"):
+            assert ada.get(path).status_code == 200, path
+    assert new.post("/api/login", json=given).status_code == 200
+    assert (ada.get("/api/session").status_code, prefect.get("/x").text) == (200, "of Prefect")
 
 
 def test_results_of_a_match_on_a_silent_disk_are_not_called_current(two, monkeypatch):

@@ -61,8 +61,8 @@ def plan_gc(
 
     Args:
         store: the project.
-        keep_last: keep only this many of each match's newest run records, and the newest complete
-            one with results of each stage; None keeps all.
+        keep_last: keep only this many of each match's newest run records, the newest complete one
+            with results of each stage, and all iterations of the last call; None keeps all.
         forget: runs to drop, as `match/0003`; an unfinished one counts as dead, and a pinned one
             must be unpinned first.
         older_than: the age below which results and leftovers are kept.
@@ -196,6 +196,7 @@ def _select_runs(
     chosen = {*pinned, *wanted}
     if keep_last is not None:
         last = {*finished[-keep_last:], *_find_last_of_stages(read, wanted)}
+        last |= {*_find_iterations(read, wanted)}
         chosen = {*pinned, *({*wanted} & last)}
     kept = [run_id for run_id in finished if run_id in chosen]
     return [run_id for run_id in finished if run_id not in kept], kept
@@ -214,6 +215,21 @@ def _find_last_of_stages(read: Callable[[str], RunRecord], run_ids: Sequence[str
             if record.state == state and stages - had:
                 had |= stages
                 yield run_id
+
+
+def _find_iterations(read: Callable[[str], RunRecord], run_ids: Sequence[str]) -> Iterator[str]:
+    """Yield the newest run of each iteration of the last call: the next call compares them all."""
+    seen: set[int] = set()
+    for run_id in reversed(run_ids):
+        try:
+            iteration = read(run_id).iteration
+        except (CorruptionError, InputError):
+            return
+        if iteration not in seen:
+            yield run_id
+        elif iteration == 1:  # that of an earlier call
+            return
+        seen.add(iteration)
 
 
 def _reservations(

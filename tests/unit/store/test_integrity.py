@@ -286,6 +286,18 @@ def test_the_newest_complete_run_outlasts_newer_ones_that_failed(two_runs):
     assert plan.garbage[0].path == "runs/final/0002.json"
 
 
+@pytest.mark.parametrize(
+    ("iterations", "kept"),
+    [([2, 1, 1], [3]), ([1, 2, 3, 2], [1, 3, 4]), ([1, 2, 1], [2, 3]), ([1, 1, 2, 3], [2, 3, 4])],
+)
+def test_the_iterations_of_the_last_call_outlast_those_before(folder_store, iterations, kept):
+    for iteration in iterations:
+        number = folder_store.reserve_run("final")
+        folder_store.finish_run(sample_record(number, iteration=iteration))
+    collect(folder_store, plan_gc(folder_store, keep_last=1, older_than=PLAN_NOW))
+    assert folder_store.runs("final") == tuple(f"{number:04}" for number in kept)
+
+
 @pytest.mark.parametrize("state", ["complete", "partial"])
 def test_the_newest_run_with_bodies_outlasts_newer_parts_of_the_method(two_runs, state):
     tracked, fitted = sample_recipe("third"), sample_recipe(stage="body_fitting")
