@@ -70,9 +70,7 @@ class ChangeSums:
         middles = np.concatenate([np.zeros(0), *(one.rows for one in parts)])
         # Two stretches may share a bin.
         rows, number = np.unique(middles, return_inverse=True)
-        matrix, score = np.zeros((len(rows), *every.shape[1:])), np.zeros((len(rows), size))
-        np.add.at(matrix, number, every)
-        np.add.at(score, number, pulls)
+        matrix, score = (_add_up(each, number, len(rows)) for each in (every, pulls))
         return cls(matrix, score, rows, fps, cameras.focal.mean(axis=-1))
 
     @property
@@ -160,17 +158,10 @@ class ChangeSums:
         matrix, score = self.of_camera(camera, "view")
         block, place = np.divmod(self.rows.astype(int), places)
         blocks, width = int(block.max(initial=0)) + 1, score.shape[1]
-        time = (block + 0.5) / blocks - 0.5
-
-        def add_up(values: Floats, group: Integers, count: int) -> Floats:
-            out = np.zeros((count, *values.shape[1:]))
-            np.add.at(out, group, values)
-            return out
-
-        prior = np.diag(PRIOR)
-        constant = np.linalg.inv(add_up(matrix, place, places) + prior)
-        follows = constant @ add_up(time[:, None, None] * matrix, place, places)
-        own = (constant @ add_up(score, place, places)[..., None])[..., 0]
+        time, prior = (block + 0.5) / blocks - 0.5, np.diag(PRIOR)
+        constant = np.linalg.inv(_add_up(matrix, place, places) + prior)
+        follows = constant @ _add_up(time[:, None, None] * matrix, place, places)
+        own = (constant @ _add_up(score, place, places)[..., None])[..., 0]
         columns = time[:, None, None] * np.eye(width) - follows[place]
         held = columns.swapaxes(1, 2) @ matrix
         total = np.einsum("bij,bjk->ik", held, columns)
@@ -179,12 +170,12 @@ class ChangeSums:
         left = score - (matrix @ own[place][..., None])[..., 0]
         drift = inverse @ (time @ left)
         left -= (matrix @ (columns @ drift)[..., None])[..., 0]
-        pull = add_up((columns.swapaxes(1, 2) @ left[..., None])[..., 0], block, blocks) @ inverse
+        pull = _add_up((columns.swapaxes(1, 2) @ left[..., None])[..., 0], block, blocks) @ inverse
         free = blocks - width - 1
         if free < 1:
             return 0.0, 1
-        spread = pull.T @ pull * (width * blocks / free)
-        return float(drift @ np.linalg.solve(spread, drift)), free
+        spread = pull.T @ pull * (width * blocks / free)  # 0 of a camera that sees nobody
+        return float(drift @ np.linalg.pinv(spread, hermitian=True) @ drift), free
 
     def sway(self, camera: int) -> tuple[float, float]:
         """Return the usual size of a view's change in a second [rad], and its gain [1]."""
@@ -232,6 +223,12 @@ class ChangeSums:
 
 _INFORMATION: Final = 1e-2 * np.array([1e-2, *PRIOR])
 """Weak information on the unknowns of a camera in a block of bins."""
+
+
+def _add_up(values: Floats, group: Integers, count: int) -> Floats:
+    out = np.zeros((count, *values.shape[1:]))
+    np.add.at(out, group, values)
+    return out
 
 
 def _median(values: Floats) -> float:

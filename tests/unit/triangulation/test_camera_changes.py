@@ -177,35 +177,37 @@ def test_the_changed_camera_is_named_and_measured(cameras, spoil, row, amount):
         assert found.amount[4] == pytest.approx(amount, abs=0.25)
 
 
-def minute(cameras, across, sunk):
-    """A minute of people who go from -across to across [m], as a view that sinks [px] sees them."""
+def minute(cameras, sunk, apart=0.0, error=0.0):
+    """A minute of people who go apart [m], as a view that sinks [px] sees them.
+
+    It has a constant error at the left and right of its image [px], and none in the middle.
+    """
     joints, frame = runner(3000, 3)[::5], np.arange(600)
-    joints[..., 0] += np.linspace(-across, across, 600)[:, None, None]
+    way = joints[..., :2].mean(axis=2, keepdims=True)
+    way /= np.linalg.norm(way, axis=-1, keepdims=True)
+    joints[..., :2] += np.linspace(0.0, apart, 600)[:, None, None, None] * way
     pixels, confidence, index = detections(cameras, joints, 1.0)
-    pixels[:, BAD, ..., 1] += sunk * frame[:, None, None] / 599
+    middle = cameras[BAD].image_size[0] / 2
+    wrong = error * np.abs(pixels[:, BAD, ..., 0] / middle - 1.0)
+    pixels[:, BAD, ..., 1] += wrong + sunk * frame[:, None, None] / 599
     return KeypointDetections.from_keypoints(pixels, confidence, index, frame)
 
 
 def test_a_view_that_sinks_a_twentieth_of_a_degree_in_a_minute_is_found(cameras):
-    people, rows = minute(cameras, 0.0, 1.3), np.arange(600)
+    people, rows = minute(cameras, 1.3), np.arange(600)
     sums = sum_clip(cameras, people, FPS / 5, rows)
     (found,) = find_changes(cameras, people, FPS / 5, rows, sums, ("view",))
     assert (found.camera, found.row) == (BAD, None)
     np.testing.assert_allclose(found.amount[:2], [0.0, 1.3], atol=0.2)
 
 
-@pytest.mark.parametrize("sunk", [0.0, 1.3])
-def test_people_who_cross_a_view_show_no_drift_by_its_lens(cameras, sunk):
-    lens = np.zeros_like(cameras.distortion)
-    lens[BAD, 0] = 0.3
-    given, people = (
-        replace(cameras, distortion=cameras.distortion + lens),
-        minute(cameras, 6.0, sunk),
-    )
-    add_up = partial(sum_clip, given, people, FPS / 5, np.arange(600))
+@pytest.mark.parametrize(("sunk", "error"), [(0.0, 5.0), (2.0, 0.0)])
+def test_people_who_go_apart_show_no_drift_by_the_errors_of_a_view(cameras, sunk, error):
+    people = minute(cameras, sunk, 7.0, error)
+    add_up = partial(sum_clip, cameras, people, FPS / 5, np.arange(600))
     constants = [Part(c, "constant", 0, (0.0,)) for c in range(4)]
-    drift = Part(BAD, "drift", 0, (-sunk / 1520.0, 0.0, 0.0, 0.0))
-    assert drifts_in_place(add_up, constants, drift, 600, FPS / 5) == (sunk > 0.0)
+    seeming = Part(BAD, "drift", 0, (-2.0 / 1520.0, 0.0, 0.0, 0.0))
+    assert drifts_in_place(add_up, constants, seeming, 600, FPS / 5) == (sunk > 0.0)
 
 
 def test_all_frames_tell_when_a_view_steps_between_sampled_ones(cameras):
