@@ -58,10 +58,10 @@ def export(
     """
     from flows.registering import find_registration, open_match
     from flows.results.best_results import Origin, describe_age, open_results
-    from flows.results.export import LENS_ERRORS
     from flows.results.export import export as export_formats
     from flows.results.export import release as write_release
     from flows.review.identities import lost_names
+    from worldpose.dataset.manifest import LENS_ERRORS
 
     changed = "--filled" if filled else "--definition detector"
     if release is not None and (licence is None or filled or definition == "detector"):

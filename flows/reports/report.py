@@ -35,7 +35,7 @@ from flows.results.best_results import (
     joint_tracks,
     open_results,
 )
-from flows.results.evaluation import load_reference, score
+from flows.results.evaluation import reference_side, score
 from flows.results.run_cameras import BROADCAST, broadcast_cameras, broadcast_views, static_cameras
 from flows.review.descriptions import in_words, is_first_click, when
 from flows.stage import Match
@@ -236,7 +236,7 @@ def _against_truth(
         return None, None, ""
     truth = None
     try:
-        truth = load_reference(source)
+        truth = reference_side(source).joints
         if len(clips) == 1:
             scores = score(match.match_id, source, store.url, run_id=run.record.run_id)
             return scores.evaluation, truth, ""

@@ -31,7 +31,7 @@ from worldpose.simulation.foreign.matches import simulate_foreign_scene
 from worldpose.simulation.foreign.scenarios import FOREIGN_SCENARIOS
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
-from worldpose.simulation.settings import ClickSettings
+from worldpose.simulation.settings import ClickSettings, MatchOptions
 from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.report import StaticCalibration
 from worldpose.static_calibration.settings import StaticCalibrationSettings
@@ -110,7 +110,8 @@ def simulate(seed: int, clicks: ClickSettings | None) -> Trial:
         return Trial(scenario.fps, own.truth, own.cameras, clicked, seen, *pitches)
     close = {"given": 0.0, "unsynchronised": 0.0, "area": (0.08, 0.13)}
     kind = FOREIGN_SCENARIOS["foreign-match"].model_copy(update=close)
-    scene = simulate_foreign_scene(kind, seed, duration=2.0, cameras=10, people=6)
+    options = MatchOptions(duration=2.0, cameras=10, players=6)
+    scene = simulate_foreign_scene(kind, seed, options)
     assert scene.pitch is not None
     cameras = {name: each.camera for name, each in scene.cameras.items()}
     seen = {name: each.observations for name, each in scene.reports.items()}
