@@ -15,7 +15,7 @@ from worldpose.ingest.validation import validate_record
 if TYPE_CHECKING:
     from worldpose.ingest.match_folder import MatchFolder
 
-T = TypeVar("T")
+Named = TypeVar("Named")
 
 
 def names_at_venue(
@@ -79,7 +79,7 @@ def rename_cameras(match: MatchFolder, called: Mapping[str, str]) -> MatchFolder
     spec = validate_record(MatchSpec, content, where)
     names = {**called, **dict(zip(match.spec.broadcast_views, spec.broadcast_views, strict=True))}
 
-    def renamed(found: Mapping[str, T]) -> dict[str, T]:
+    def renamed(found: Mapping[str, Named]) -> dict[str, Named]:
         return {names.get(name, name): each for name, each in found.items()}
 
     posed, lenses = renamed(match.calibrations), renamed(match.lenses)
