@@ -43,7 +43,6 @@ def seen_in_broadcast(match: Match, view: str) -> tuple[str, ...]:
 
 
 @once_a_match
-@once_a_match
 def _units(match: Match) -> dict[str, tuple[str, str]]:
     """Return the unit of `ingest` and the clip of each unit, without given 2D poses."""
     folder, views = match.folder, match.folder.spec.broadcast_views

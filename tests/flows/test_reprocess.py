@@ -68,7 +68,7 @@ def test_an_edit_makes_what_was_made_from_it_stale_and_nothing_else(store, edit)
     settings, starts = edit(store)
     found = run_status(store, TINY, settings)
     expected = made_from(store, *starts)
-    assert {unit.unit for unit in found.units} == expected
+    assert {unit.planned.name for unit in found.units} == expected
     assert len(found.to_compute) == len(expected)
     assert {unit.planned.name for unit in found.units if unit.own_reasons} == set(starts)
 
@@ -81,7 +81,7 @@ def test_new_code_makes_what_is_computed_with_it_stale(store, monkeypatch):
 
     monkeypatch.setattr(run_plan, "code_version", newer)
     (unit,) = run_status(store, TINY).units
-    assert (unit.unit, unit.state) == ("filtering/clip", "stale")
+    assert (unit.planned.name, unit.state) == ("filtering/clip", "stale")
     assert any("worldpose.filtering.judging" in str(reason) for reason in unit.own_reasons)
 
 
@@ -104,7 +104,7 @@ def test_a_run_that_ended_earlier_is_made_current_as_far_as_it_went(store):
     edit_box(store)
     found = run_status(store, TINY)
     assert found.until_stage == "triangulation"
-    assert {unit.unit for unit in found.units} >= {"tracking/clip", "triangulation/clip"}
+    assert {unit.planned.name for unit in found.units} >= {"tracking/clip", "triangulation/clip"}
 
 
 @pytest.mark.parametrize(
@@ -127,7 +127,7 @@ def test_what_failed_is_tried_again_when_something_is_another(store, error, agai
         )
     assert run_status(store, TINY, retry=True).is_stale
     edit_box(store)
-    assert "tracking/clip" in {unit.unit for unit in run_status(store, TINY).units}
+    assert "tracking/clip" in {unit.planned.name for unit in run_status(store, TINY).units}
 
 
 def test_a_later_iteration_is_stale_in_every_pass(store):
