@@ -327,9 +327,12 @@ def decode_candidates(maps: Tensor, count: int) -> tuple[Tensor, Tensor]:
         places, masses = map(torch.from_numpy, _find_candidates(given, count, np.float32(least)))
     else:
         chance = torch.softmax(flat.flatten(1), dim=1).view_as(flat)
-        peak = chance == functional.max_pool2d(chance, 7, stride=1, padding=3)
-        peak &= chance >= chance.amax(dim=(1, 2), keepdim=True).clamp(max=least)
-        cells = torch.nonzero(peak, as_tuple=True)
+        # As in the kernel, of equal cells in a block of 4 x 4 the first is the peak.
+        high, at = (each.flatten(1) for each in functional.max_pool2d_with_indices(chance, 4))
+        near = functional.max_pool2d(chance, 7, stride=1, padding=3).flatten(1).gather(1, at)
+        peak = (high == near) & (high >= high.amax(dim=1, keepdim=True).clamp(max=least))
+        cell, width = at[peak], maps.shape[-1]
+        cells = (torch.nonzero(peak)[:, 0], cell // width, cell % width)
         at, mass = _means(chance, cells)
         order = torch.argsort(mass, descending=True, stable=True)
         order = order[torch.argsort(cells[0][order], stable=True)]
