@@ -13,8 +13,10 @@ FIRST_RUN = rm -rf $(FIRST)/$(1) && $(BIN)/worldpose simulate --scenario tiny $(
 GIVEN = $(call FIRST_RUN,given,--duration 0.5 --calibrated --no-stills)
 STILLS = $(call FIRST_RUN,stills,--duration 0.2,--until static_calibration) && $(IMPORTS)
 # What other commands and stages import, for its bytecode, while the longer run still compiles.
+# The kernels of detection compile for maps of no people.
 IMPORTS = $(BIN)/python -c 'import flows.reports.report, flows.results.evaluation, onnxruntime, worldpose.detection.bundled_pose, \
-  tasks.broadcast_calibration, tasks.detection, tasks.refitting'
+  tasks.broadcast_calibration, tasks.detection, tasks.refitting, torch, worldpose.detection.bundled_nets as nets; \
+  nets.decode_boxes([(torch.zeros(1, 4, 4), torch.zeros(1, 4, 4, 4))], 0.9); nets.decode_candidates(torch.zeros(1, 1, 8, 8), 4)'
 # Where it is set, each of the hundreds of processes of the tests would compile all sources again.
 unexport PYTHONDONTWRITEBYTECODE
 

@@ -250,8 +250,8 @@ def decode_boxes(maps: Sequence[tuple[Tensor, ...]], least: float) -> Tensor:
     limit, first, found = math.log(least / (1.0 - least)), 0, list[Tensor]()
     for logits, sides in maps:
         if logits.is_cpu:
-            cells = np.flatnonzero(logits.numpy() >= limit)
-            rows = torch.from_numpy(_find_boxes(logits.numpy(), sides.numpy(), cells))
+            score, side = (each.contiguous().numpy() for each in (logits, sides))  # one kernel
+            rows = torch.from_numpy(_find_boxes(score, side, np.flatnonzero(score >= limit)))
         else:
             high = functional.max_pool2d(logits, 3, stride=1, padding=1)
             image, row, column = torch.nonzero((logits == high) & (logits >= limit), as_tuple=True)

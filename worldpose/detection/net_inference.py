@@ -115,7 +115,9 @@ class PlacedNet:
         count = len(given[0])
         placed = (torch.as_tensor(each, device=self.device) for each in given)
         missing = -count % min(self._fill, self.batch)
-        images, *maps = (pad(each, [0, 0] * (each.ndim - 1) + [0, missing]) for each in placed)
+        if missing:
+            placed = (pad(each, [0, 0] * (each.ndim - 1) + [0, missing]) for each in placed)
+        images, *maps = placed
         images = normalize(images)
         outputs: Tensors = self._net(*(each.to(self._kind) for each in (images, *maps)))
         if count == len(images):

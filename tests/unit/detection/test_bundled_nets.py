@@ -81,6 +81,13 @@ class Elsewhere(torch.Tensor):
     is_cpu = False
 
 
+def test_torch_alone_takes_the_first_of_equal_cells_as_the_kernel():
+    maps = torch.zeros(1, 1, 32, 24)
+    both = [decode_candidates(maps.as_subclass(kind), 4) for kind in (torch.Tensor, Elsewhere)]
+    for kernel, alone in zip(*both, strict=True):
+        np.testing.assert_allclose(kernel.numpy(), alone.numpy(), rtol=1e-6)
+
+
 def test_torch_alone_finds_the_boxes_of_the_kernel():
     rng = np.random.default_rng(6)
     given = []
