@@ -59,6 +59,3 @@ class RunSettings(UsableLimits):
     """Lenses of static cameras, by their id, that neither lenses.toml nor calibration.toml has."""
     sides: dict[Name, Side] = {}
     """Camera to its side of the pitch, where match.yaml states none."""
-    cameras: dict[Name, str] = {}
-    """Camera to a pattern, as `cam-03*`, of what match.yaml or a video's file calls it otherwise: a
-    match then has the name here. `*` is any text, `?` any letter. Files keep their names."""

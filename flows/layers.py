@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Container, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -26,7 +26,7 @@ from data_contracts.settings import RunSettings
 from worldpose.body.body_file import given_body_folder
 from worldpose.errors import InputError
 from worldpose.formats.files import parse_yaml
-from worldpose.ingest.match_folder import MatchFolder, image_sizes, read_match, read_spec
+from worldpose.ingest.match_folder import MatchFolder, image_sizes
 from worldpose.ingest.pitch_file import pitch_file, read_pitch
 from worldpose.ingest.validation import validate_record
 from worldpose.pitch.template import PitchTemplate
@@ -194,17 +194,6 @@ def pitch_in_words(store: Store, folder: Path, spec: MatchSpec) -> tuple[PitchSp
             origin = [each.origin for each in layers if each.values.get("pitch") is not None][-1]
             return found, f"the {found.template} pitch in the settings of the {origin}"
     return read_pitch(folder, spec), "the pitch"
-
-
-def read_folder(store: Store, folder: Path, known: Container[str] = ()) -> MatchFolder:
-    """Read a match folder, as `read_match`, with the names of cameras and the pitch of its layers.
-
-    Raises:
-        InputError: as `read_match`; patterns of names contradict each other.
-    """
-    spec = read_spec(folder)
-    names = merge_general(read_layers(store, spec)).cameras
-    return read_match(folder, known, *pitch_in_words(store, folder, spec), names)
 
 
 def known_pitch(store: Store, folder: Path, spec: MatchSpec) -> PitchSpec | None:

@@ -106,7 +106,7 @@ async def ask_disk(place: str, read: Callable[[], T]) -> T:
     late = _Late[T](None, [])
     with _LOCK:
         asked = _ASKED[place] = [it for it in _ASKED.get(place, ()) if not it.made.done()]
-        if any(each.is_silent() for each in asked):
+        if len(asked) >= MOST_SILENT or any(each.is_silent() for each in asked):
             raise SilentDiskError
         asked.append(late)
     threading.Thread(target=late.run, args=[lambda _: read()], daemon=True).start()

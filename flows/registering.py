@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Container
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from data_contracts.match import MatchSpec, Registration, SourceFile
-from flows.layers import merge_general, pitch_of_run, read_folder, read_layers
+from flows.layers import pitch_in_words, pitch_of_run, read_layers
 from flows.review.corrections import corrected_match
 from flows.stage import Match
 from worldpose.errors import CorruptionError, InputError
 from worldpose.formats.detection_files import read_boxes
-from worldpose.ingest.camera_names import names_at_venue
 from worldpose.ingest.footage import read_still, read_unit, require_footage
-from worldpose.ingest.match_folder import MatchFolder, read_spec, require_calibrated
+from worldpose.ingest.match_folder import MatchFolder, read_match, read_spec, require_calibrated
 from worldpose.ingest.registration import READERS, register_match
 from worldpose.ingest.validation import reachable
 from worldpose.review.journal import read_journal
@@ -44,7 +42,8 @@ def register(
     without all cameras known; people click them on the pages. `known_as` is the id that the folder
     must have.
     """
-    match_id = read_spec(folder).match_id
+    spec = read_spec(folder)
+    match_id = spec.match_id
     if known_as not in (None, match_id):
         raise InputError(
             f"{folder}: match.yaml: match_id",
@@ -57,7 +56,7 @@ def register(
     with reachable(folder):
         at_home = previous is not None and previous.folder == str(folder.resolve())
     known = [file.path for file in previous.files] if previous is not None and at_home else ()
-    match_folder = read_folder(store, folder, known)
+    match_folder = read_match(folder, known, *pitch_in_words(store, folder, spec))
     is_next = previous is not None and previous.folder == replaces
     if replaces is not None and not is_next and not at_home:
         raise InputError(
@@ -141,12 +140,8 @@ def open_stored(store: Store, name: str) -> Match:
             pitch = pitch_of_run(Run(store, store.run(match_id)), lambda: None)
         paths = [Path(registration.folder, file.path) for file in registration.files]
         given = {path.stem: path for path in paths if path.parent.name == "detections"}
-        journal, layers = read_journal(store, match_id), read_layers(store, spec)
-        with suppress(InputError):  # the settings have changed since
-            stems = {stem: (stem,) for stem in given}
-            called = names_at_venue(stems, merge_general(layers).cameras, match_id)
-            given = {called.get(stem, stem): path for stem, path in given.items()}
         folder = MatchFolder(Path(registration.folder), spec, {}, given, pitch, {}, {}, {}, {})
+        journal, layers = read_journal(store, match_id), read_layers(store, spec)
         return Match(folder, registration, journal, layers=layers)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from math import isnan
 from pathlib import Path
@@ -15,9 +14,8 @@ from data_contracts.match import MatchSpec
 from data_contracts.pitch import TemplateName
 from flows.cli.console import answer, errors, line, print_json, print_table
 from flows.cli.options import DEFAULT_PROJECT, given_options
-from flows.layers import VENUES, known_pitch, read_layer
+from flows.layers import known_pitch
 from flows.registering import register
-from flows.settings import resolve
 from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.formats.calibration_unit import doubt_middle
@@ -41,7 +39,6 @@ def import_command(
     challenge: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
     fps: float | None = None,
     match_id: str | None = None,
-    venue: str | None = None,
     pitch: Path | None = None,
     clicks: Path | None = None,
     camera: str | None = None,
@@ -77,7 +74,6 @@ def import_command(
         challenge: Folder of a pose challenge: cameras/, boxes/, videos/ or images/, skel_2d/,
             skel_3d/ and pitch_points.txt; writes OUT/<sequence> for each sequence.
         match_id: Id of the match; the folder's name by default.
-        venue: Its venue in the project, whose pitch, lenses, sides and names of cameras count.
         pitch: Survey of the markings (CSV); writes only pitch.json.
         clicks: Clicks from CVAT (XML), Label Studio, COCO or SoccerNet (JSON). A label is the
             name of a point or marking of the pitch, or a position in metres.
@@ -104,8 +100,6 @@ def import_command(
     kind = next((name for name in ALONE if name in given), None)
     if kind is not None:
         _require_alone(kind, given)
-    if venue is not None:
-        resolve([read_layer(Store.open(project), f"{VENUES}/{venue}")])
     place = None
     if kind in (None, "--pose2sim"):
         from worldpose.triangulation.world import place_as_stated  # late: it loads the tracker
@@ -133,7 +127,7 @@ def import_command(
         _import_challenge(challenge, out, fps)
     elif pose2sim is not None:
         spec, notes = import_pose2sim(pose2sim, out, fps=fps, match_id=match_id, place=place)
-        _print_match(spec, out, notes, venue)
+        _print_match(spec, out, notes)
     elif videos is not None and detections is None:
         spec, notes = import_videos(
             calibration,
@@ -145,7 +139,7 @@ def import_command(
             place=place,
             join=join,
         )
-        _print_match(spec, out, notes, venue)
+        _print_match(spec, out, notes)
     elif calibration is None or detections is None or videos is not None or fps is None:
         raise UsageError(
             "worldpose import",
@@ -157,14 +151,14 @@ def import_command(
         spec, notes = import_match(
             calibration, detections, fps, out, match_id=match_id, place=place
         )
-        _print_match(spec, out, notes, venue)
+        _print_match(spec, out, notes)
 
 
 ALONE: Final = {
     "--boxes": ("with --videos, or with --out alone", ()),
     "--pose2sim": (
-        "with --out, and --fps, --match-id, --unit, --up or --venue",
-        ("--fps", "--match-id", "--unit", "--up", "--venue"),
+        "with --out, and --fps, --match-id, --unit or --up",
+        ("--fps", "--match-id", "--unit", "--up"),
     ),
     "--challenge": ("with --out, and --fps for images", ("--fps",)),
     "--lens": ("with --out, and --camera if the file does not name its camera", ("--camera",)),
@@ -211,19 +205,16 @@ def _import_challenge(kit: Path, out: Path, fps: float | None) -> None:
     answer({"folders": folders, "notes": lines}, *lines, *following)
 
 
-def _print_match(spec: MatchSpec, out: Path, notes: list[str], venue: str | None) -> None:
-    """Add the venue to a match that was made; print it, and sentences about what was found."""
-    if venue is not None:
-        with (out / "match.yaml").open("a", encoding="utf-8") as file:
-            file.write(f"venue: {json.dumps(venue)}\n")
+def _print_match(spec: MatchSpec, out: Path, notes: list[str]) -> None:
+    """Print a match that was made, and sentences about what was found."""
     about = {"notes": notes} if notes else {}
     print_json({"match": spec.match_id, "folder": str(out), **about})
     clip = spec.clips[0]
     for note in notes:
         line(note)
     for camera in spec.cameras:
-        if camera.video is not None and (name := Path(camera.video)).stem != camera.id:
-            line(f"{name.name} is camera {camera.id}")
+        if camera.video is not None and (file := Path(camera.video)).stem != camera.id:
+            line(f"{file.name} is camera {camera.id}")
     line(
         f"made match {spec.match_id} in {out}: {len(spec.cameras)} cameras, frames "
         f"{clip.first_frame} to {clip.first_frame + clip.frame_count - 1}"

@@ -20,7 +20,7 @@ import yaml
 from pydantic import JsonValue
 
 from data_contracts.match import MatchSpec
-from flows.layers import read_folder
+from flows.layers import pitch_in_words
 from flows.method import METHOD
 from flows.registering import register_next
 from flows.review.corrections import corrected_match
@@ -38,7 +38,7 @@ from flows.web.draft_problems import (
 )
 from worldpose.errors import InputError
 from worldpose.formats.files import read_yaml
-from worldpose.ingest.match_folder import MatchFolder, read_match
+from worldpose.ingest.match_folder import MatchFolder, read_match, read_spec
 from worldpose.ingest.registration import register_match
 from worldpose.ingest.validation import reachable
 from worldpose.store.store import Store
@@ -152,8 +152,7 @@ def build(
         taken = take_given(store, given, folder, indexes) if given.is_dir() else []
         # No paths of this machine, no options of commands.
         notes = [re.sub(r"; --\w+ states another", "", it.replace(f"{given}/", "")) for it in taken]
-        match = read_folder(store, folder)
-        notes += [f"{own} is {name} at the venue" for name, own in match.own_names.items()]
+        match = read_match(folder, (), *pitch_in_words(store, folder, read_spec(folder)))
     except InputError as error:
         return [describe(error, folder, given)], notes
     owners = {*(each.id for each in match.spec.cameras), *match.spec.broadcast_views}

@@ -16,7 +16,7 @@ from pydantic import Field, JsonValue
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec, Side
 from data_contracts.records import CONTRACT_VERSION, Count, Name, Record
-from flows.layers import known_pitch, merge_general, read_layers
+from flows.layers import known_pitch
 from flows.web.browser_words import in_browser
 from worldpose.errors import InputError
 from worldpose.formats.annotations.marked_images import read_marked_images
@@ -30,7 +30,6 @@ from worldpose.formats.calibration_forms import (
 from worldpose.formats.calibration_unit import doubt_middle
 from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.formats.keypoint_files import read_people
-from worldpose.ingest.camera_names import names_of_spec
 from worldpose.ingest.camera_videos import fit_to_video
 from worldpose.ingest.clicks import import_clicks
 from worldpose.ingest.footage import read_still, require_footage
@@ -276,8 +275,7 @@ def take_given(
         notes += doubt_middle(owner, lens.principal_point_px, lens.image_size)
     if posed:
         where = posed.pop() if len(posed) == 1 else given
-        names = merge_general(read_layers(store, spec)).cameras
-        notes += _take_calibration(where, folder, indexes, people, names_of_spec(spec, names))
+        notes += _take_calibration(where, folder, indexes, people)
     return notes
 
 
@@ -322,20 +320,12 @@ def _take_calibration(
     folder: Path,
     indexes: Mapping[str, Index | None],
     people: Mapping[str, KeypointDetections],
-    called: Mapping[str, str],
 ) -> list[str]:
-    """Write the cameras of a calibration to calibration.toml, in the pixels of their videos.
-
-    It has the names of match.yaml, or those that the venue has for them.
-    """
+    """Write the cameras of a calibration to calibration.toml, in the pixels of their videos."""
     from worldpose.triangulation.world import place_as_stated  # late: it loads the tracker
 
     spec, left_out = read_spec(folder), LeftOut()
-    sizes = image_sizes(spec)
-    sizes |= {new: sizes[old] for old, new in called.items() if old in sizes}
-    cameras = read_calibration(source, sizes, left_out, any_unit=True)
-    for old in [old for old, new in called.items() if old not in cameras and new in cameras]:
-        cameras[old] = cameras.pop(called[old]).model_copy(update={"id": old})
+    cameras = read_calibration(source, image_sizes(spec), left_out, any_unit=True)
     known = {camera.id: camera for camera in spec.static_cameras if camera.id in cameras}
     if not known:
         raise InputError(

@@ -25,7 +25,6 @@ from worldpose.ingest.annotations import (
     read_clicked,
     read_key_frames,
 )
-from worldpose.ingest.camera_names import names_of_spec, rename_cameras
 from worldpose.ingest.pitch_file import pitch_file, read_pitch
 from worldpose.ingest.validation import (
     existing_file,
@@ -59,7 +58,6 @@ class MatchFolder:
             broadcast view in an npy file state who is who.
         camera_data: what a tracking system states about the camera, by name of a broadcast view;
             may lack some.
-        own_names: the folder's name of each camera that the venue calls otherwise, by that name.
     """
 
     folder: Path
@@ -75,7 +73,6 @@ class MatchFolder:
     estimates: Mapping[str, Path] = field(default_factory=dict)
     boxes: Mapping[str, Path] = field(default_factory=dict)
     camera_data: Mapping[str, Path] = field(default_factory=dict)
-    own_names: Mapping[str, str] = field(default_factory=dict)
 
     def clip(self, clip_id: str | None = None) -> ClipSpec:
         """Return the clip with this id, or the first one; InputError if there is none."""
@@ -129,7 +126,6 @@ def read_match(
     known: Container[str] = (),
     pitch: PitchSpec | None = None,
     whose: str | None = "the pitch",
-    names: Mapping[str, str] | None = None,
 ) -> MatchFolder:
     """Return the validated content of a match folder, without opening videos, stills, detections.
 
@@ -139,8 +135,6 @@ def read_match(
         pitch: that of the settings, whose names clicks have; None = the folder's or the standard
             one. Of a venue of match.yaml without pitch.json, names are checked with `pitch` alone.
         whose: that pitch in words, for messages; None = the names of clicks are not checked.
-        names: the venue's names of cameras, with the patterns of `names_at_venue`; calibration.toml
-            may have them, all other files have the names of match.yaml.
 
     Raises:
         InputError: the folder is unreadable (its disk is not mounted, or this user has no
@@ -149,7 +143,7 @@ def read_match(
     """
     folder = Path(folder)
     with reachable(folder):
-        return _read_match(folder, known, pitch, whose, names or {})
+        return _read_match(folder, known, pitch, whose)
 
 
 def read_spec(folder: Path) -> MatchSpec:
@@ -175,14 +169,9 @@ def spec_around(path: Path) -> tuple[Path, MatchSpec] | None:
 
 
 def _read_match(
-    folder: Path,
-    known: Container[str],
-    clicked_on: PitchSpec | None,
-    whose: str | None,
-    names: Mapping[str, str],
+    folder: Path, known: Container[str], clicked_on: PitchSpec | None, whose: str | None
 ) -> MatchFolder:
     spec = read_spec(folder)
-    called = names_of_spec(spec, names)
     if not (spec.static_cameras or spec.broadcast_views):
         raise InputError(
             f"{folder / 'match.yaml'}: cameras",
@@ -200,8 +189,8 @@ def _read_match(
     if clicked_on is None and spec.venue is not None and pitch_file(folder, spec) is None:
         whose = None
     clicked_on = clicked_on or pitch
-    calibrations = _calibrations(folder, spec, {new: old for old, new in called.items()})
-    match = MatchFolder(
+    calibrations = _calibrations(folder, spec)
+    return MatchFolder(
         folder=folder,
         spec=spec,
         calibrations=calibrations,
@@ -216,7 +205,6 @@ def _read_match(
         boxes=_boxes(folder, spec, videos, detections),
         camera_data=_estimates(folder, spec, CAMERA_DATA),
     )
-    return rename_cameras(match, called)
 
 
 def require_calibrated(match: MatchFolder) -> None:
@@ -232,11 +220,10 @@ def require_calibrated(match: MatchFolder) -> None:
     known = {**match.calibrations, **match.clicked}
     missing = match.to_click
     if missing:
-        first = match.own_names.get(missing[0], missing[0])
         needed = f"Add the missing cameras to {match.folder / 'calibration.toml'}"
         if match.pitch is not None:
             needed = (
-                f"Click {CLICKS_NEEDED} into {match.folder / clicked_file(first)}, or click "
+                f"Click {CLICKS_NEEDED} into {match.folder / clicked_file(missing[0])}, or click "
                 f"on the pages: worldpose ingest {match.folder}, then worldpose review serve; or "
                 "give one camera a side (near, far, left, right) in match.yaml, so that the images "
                 "are calibrated without clicks; or add the camera to calibration.toml"
@@ -276,17 +263,12 @@ def _require_key_frames(match: MatchFolder) -> None:
     raise InputError(str(match.folder), expected, found, todo)
 
 
-def _calibrations(
-    folder: Path, spec: MatchSpec, own_names: Mapping[str, str]
-) -> dict[str, CameraCalibration]:
+def _calibrations(folder: Path, spec: MatchSpec) -> dict[str, CameraCalibration]:
     if not (folder / "calibration.toml").exists():
         return {}
     file = existing_file(folder, "calibration.toml", str(folder))
-    given = read_calibration_toml(file)
-    require_metres(file, given)
-    # Of a camera by both names, one is left to be refused.
-    own = {name: own_names.get(name, name) for name in given}
-    calibrations = {n if own[n] in given else own[n]: each for n, each in given.items()}
+    calibrations = read_calibration_toml(file)
+    require_metres(file, calibrations)
     static = {camera.id: camera for camera in spec.static_cameras}
     extra = [name for name in calibrations if name not in static]
     if extra:
