@@ -260,11 +260,13 @@ def _follow_changes(
                 changes[-1],
                 refine_change(clip.cameras, people, clip.fps, camera, changes[-1]),
             )
-            changes[-1] = after
-            if after.frame is None and before.frame is not None:  # tracked again as a slow one
+            # Just before and after it, people show nothing of a change that is no sudden one.
+            is_gone = math.hypot(*after.shift_px) < 0.25 * math.hypot(*before.shift_px)
+            if is_gone and before.frame is not None:
+                changes[-1] = _slow_change(before)
                 clip = open_clip(inputs, further=changes)
                 continue
-            is_gone = math.hypot(*after.shift_px) < 0.25 * math.hypot(*before.shift_px)
+            changes[-1] = after
             if is_gone or is_by_chance(after):
                 clip = open_clip(inputs, further=changes[:-1])
                 return clip, track(clip), tuple(changes[:-1])
@@ -281,6 +283,14 @@ def _follow_changes(
             return clip, tracks, (*changes, *(each for each in found if each.kind == "clock"))
         changes.append(views[0])
         clip = open_clip(inputs, further=changes)
+
+
+def _slow_change(change: CameraChange) -> CameraChange:
+    """Return a sudden change as one that grows over the clip to what is usual after its moment."""
+    assert change.frame is not None
+    begun = (change.frame - change.first_frame) / max(1.0, change.frame_count - 1.0)
+    x, y = (2.0 * each / (1.0 + begun) for each in change.shift_px)
+    return change.model_copy(update={"frame": None, "shift_px": (x, y)})
 
 
 def _pitch(inputs: UnitInputs) -> PitchTemplate | None:

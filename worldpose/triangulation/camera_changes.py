@@ -22,17 +22,13 @@ from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.triangulation.change_parts import (
     Part,
-    drifts_in_place,
     expected_step,
     find_sway,
     fit_parts,
     fit_sizes,
-    fit_slow,
     is_settled,
     on_common_clock,
     spreads,
-    view_amount,
-    view_size,
 )
 from worldpose.triangulation.change_sums import (
     LOOSE,
@@ -96,11 +92,11 @@ def find_changes(
         sums: equations of the people as triangulated.
         kinds: what may change.
     """
-    frames = len(rows)
+    frames, free = len(rows), None
     parts, after = _fit_clip(cameras, people, fps, rows, sums, kinds)
     swaying = find_sway(sums, after, parts) if "view" in kinds else None
-    free, is_left_out = swaying or (None, False)
-    if free is not None:
+    if swaying is not None:
+        free, is_left_out = swaying
         parts, after = _fit_clip(cameras, people, fps, rows, sums, kinds, free)
     shifting = [part for part in parts if part.shape != "constant"]
     stds = spreads(after, shifting, frames)
@@ -136,20 +132,12 @@ def _fit_clip(
     The views of a `free` camera count for nothing.
     """
     parts = [Part(c, "constant", 0, (0.0,)) for c in range(sums.cameras)]
-    tried, drifting = [[part.name for part in parts]], dict[int, bool]()
+    tried = [[part.name for part in parts]]
     for _ in range(12):
         sums = sums if free is None else sums.without_camera(free)
         add_up = partial(sum_clip, cameras, people, fps, rows)
         placed = place_steps(parts, len(rows), round(fps), partial(add_up, parts))
-        while True:
-            steady = [c for c, drifts in drifting.items() if not drifts]
-            fitted = on_common_clock(fit_parts(sums, placed, len(rows), kinds, steady))
-            slow = [part for part in fitted if part.name[1:] == ("view", "drift")]
-            new = [part for part in slow if part.camera not in drifting]
-            if not new:
-                break
-            for part in new:
-                drifting[part.camera] = drifts_in_place(add_up, parts, part, len(rows), fps)
+        fitted = on_common_clock(fit_parts(sums, placed, len(rows), kinds))
         names = [part.name for part in fitted]
         # What comes and goes is hardly clear.
         returns = names != tried[-1] and names in tried
@@ -172,6 +160,18 @@ def _measure(part: Part, std: Floats, camera: Camera, frames: int) -> MeasuredCh
     return MeasuredChange(part.camera, part.kind, row, amount, std_px, is_explained=is_usual)
 
 
+def view_amount(part: Part, camera: Camera) -> Floats:
+    """Return a size as the amount (5,) of a `MeasuredChange`."""
+    amount = np.zeros(WIDTH)
+    if part.kind == "clock":
+        amount[4] = part.size[0]
+    else:
+        x, y, roll, growth = part.size
+        fx, fy = camera.focal
+        amount[:4] = fx * y, -fy * x, math.expm1(growth), roll
+    return amount
+
+
 def sum_clip(
     cameras: Camera,
     people: KeypointDetections[ClipArray],
@@ -180,7 +180,7 @@ def sum_clip(
     parts: Sequence[Part] = (),
     settings: TriangulationSettings = LOOSE,
     near: slice = slice(None),
-    bins: tuple[int, ...] | None = None,
+    bins: tuple[int, int] | None = None,
 ) -> ChangeSums:
     """Return the equations of people who are triangulated with parts taken back.
 
@@ -192,11 +192,10 @@ def sum_clip(
         parts: parts that are corrected in the detections.
         settings: accepted deviations.
         near: the rows that count.
-        bins: as of `sum_joints`; None = those of `choose_bins`.
+        bins: as of `choose_bins`; None = its own choice.
     """
     frames, half = len(rows), half_window(fps)
-    bins = bins or choose_bins(frames * people.detection_index[0].size, fps)
-    length, every = bins[:2]
+    length, every = bins or choose_bins(frames * people.detection_index[0].size, fps)
     rig, late = Rig.from_cameras(cameras), np.zeros((len(cameras.focal), frames))
     for part in parts:
         if part.kind == "clock":
@@ -217,7 +216,7 @@ def sum_clip(
         used = np.unique(at[:, None] + np.array([-half, 0, half]))
         joints = np.full((len(seen.detection_index), seen.detection_index.shape[2], 17, 3), np.nan)
         joints[used] = triangulate_views(rig, seen[used], settings)
-        sums.append(sum_joints(cameras, seen, joints, begun, fps, bins, settings))
+        sums.append(sum_joints(cameras, seen, joints, begun, fps, (length, every), settings))
     return ChangeSums.join(sums, cameras, fps)
 
 
@@ -235,7 +234,8 @@ def place_steps(
     for number, part in enumerate(parts):
         if part.shape != "step":
             continue
-        sums = add_up(near=slice(max(0, part.row - near), part.row + near), bins=(1, 1))
+        around = slice(max(0, part.row - near), part.row + near)
+        sums = add_up(near=around, bins=(1, 1))
         placed[number] = replace(part, row=expected_step(sums, part, frames))
     return placed
 
@@ -266,8 +266,6 @@ def refine_change(
 ) -> CameraChange:
     """Return a known change of a view with what people show who were tracked through it.
 
-    A sudden one becomes a slow one if that explains more of the views in the whole clip.
-
     Args:
         cameras: batch (cameras,), at least three.
         people: detections of the tracked people of a clip, with the known change taken back.
@@ -275,25 +273,21 @@ def refine_change(
         camera: index of the camera.
         known: its change.
     """
-    frame, count = np.asarray(people.frame, dtype=np.int64), len(people.frame)
-    add_up = partial(sum_clip, cameras, people, fps, np.arange(count))
-    parts, near = [Part(c, "constant", 0, (0.0,)) for c in range(len(cameras.focal))], slice(None)
+    frame = np.asarray(people.frame, dtype=np.int64)
+    parts = [Part(c, "constant", 0, (0.0,)) for c in range(len(cameras.focal))]
     if known.frame is None:
         parts.append(Part(camera, "drift", 0, (0.0,) * 4))
+        near = slice(None)
     else:
         row = int(np.searchsorted(frame, known.frame))
-        step = Part(camera, "step", row, view_size(_view_amount(known), cameras[camera]))
-        slow = fit_slow(add_up(), [*parts, step], count)
-        if slow is not None:
-            measured = _measure(slow, np.full(4, np.inf), cameras[camera], count)
-            return change_record(measured, known.camera, frame)
-        parts.append(replace(step, size=(0.0,) * 4))
+        parts.append(Part(camera, "step", row, (0.0,) * 4))
         near = slice(max(0, row - round(6.0 * fps)), row + round(6.0 * fps))
     for _ in range(4):
-        sums = add_up(parts[-1:], near=near)
-        parts[-1] = fit_sizes(sums, parts, count)[-1]
-    std = spreads(sums, parts[-1:], count)[0]
-    measured = _measure(parts[-1], std, cameras[camera], count)
+        taken = parts[-1:]
+        sums = sum_clip(cameras, people, fps, np.arange(len(frame)), taken, near=near)
+        parts = [*parts[:-1], *fit_sizes(sums, [*parts[:-1], *taken], len(frame))[-1:]]
+    std = spreads(sums, parts[-1:], len(frame))[0]
+    measured = _measure(parts[-1], std, cameras[camera], len(frame))
     return join_changes(cameras[camera], known, change_record(measured, known.camera, frame))
 
 

@@ -15,17 +15,14 @@ with what is left, r_b, and the normal matrix N of all other parts.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Final, Literal, Self
 
 import numpy as np
-from scipy.special import fdtrc, fdtri
 
 from data_contracts.arrays import Flags, Floats, Integers
-from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.change_sums import (
     UNKNOWNS,
     WIDTH,
@@ -110,22 +107,17 @@ class Part:
 
 
 def fit_parts(
-    sums: ChangeSums,
-    parts: Sequence[Part],
-    frames: int,
-    kinds: Sequence[Kind],
-    steady: Collection[int] = (),
+    sums: ChangeSums, parts: Sequence[Part], frames: int, kinds: Sequence[Kind]
 ) -> list[Part]:
     """Return the parts that all cameras show, with their sizes.
 
-    Parts are added, the clearest first, and dropped where the others explain what they did. Views
-    of `steady` cameras drift by no less than the error of a calibration.
+    Parts are added, the clearest first, and dropped where the others explain what they did.
     """
     sums, there = _restore(sums, parts, frames)
     if not there.any():  # a clip that is shorter than what a step leaves open
         return list(parts)
     sums = sums.select(there)
-    fit = _prune(_Fit.of(sums, parts, frames), steady)
+    fit = _prune(_Fit.of(sums, parts, frames))
     # A change is noise until all are fitted: several are added, and those that are clear stay.
     grown = fit
     for _ in range(4):
@@ -133,7 +125,7 @@ def fit_parts(
         if further is None:
             break
         grown = _Fit.of(sums, [*grown.sized(), further], frames)
-    grown = _prune(grown, steady)
+    grown = _prune(grown)
     known = {part.place for part in fit.parts}
     gains = [grown.gain_of(k) * (part.place not in known) for k, part in enumerate(grown.parts)]
     # What gains less than a fifth of the largest can be its curvature: it waits until that is taken
@@ -152,14 +144,14 @@ def fit_parts(
         or p.name[1:] != ("view", "step")
         or not any(c != p.camera and abs(row - p.row) < 0.5 * sums.fps for c, row in steps)
     ]
-    return _prune(_Fit.of(sums, kept, frames), steady).sized()
+    return _prune(_Fit.of(sums, kept, frames)).sized()
 
 
-def _prune(fit: _Fit, steady: Collection[int]) -> _Fit:
+def _prune(fit: _Fit) -> _Fit:
     """Return the fit of the parts that are clear with each other."""
     while True:
         noise = fit.noise()
-        clear = [fit.clearness(k, noise, steady) for k in range(len(fit.parts))]
+        clear = [fit.clearness(k, noise) for k in range(len(fit.parts))]
         weakest = int(np.argmin(clear))
         if clear[weakest] >= 1.0:
             return fit
@@ -193,35 +185,6 @@ def fit_sizes(sums: ChangeSums, parts: Sequence[Part], frames: int) -> list[Part
     """Return the parts with their sizes, fitted together."""
     restored, there = _restore(sums, parts, frames)
     return _Fit.of(restored.select(there), parts, frames).sized()
-
-
-def fit_slow(sums: ChangeSums, parts: Sequence[Part], frames: int) -> Part | None:
-    """Return a drift in place of the last part, a step, if it explains more.
-
-    Both are changes of the views before the step is taken back, besides the other parts.
-    """
-    (*rest, step), (restored, there) = parts, _restore(sums, parts[-1:], frames)
-    both = [replace(step, shape=shape, size=(0.0,) * len(step.size)) for shape in ("step", "drift")]
-    sudden, slow = (_Fit.of(restored.select(there), [*rest, each], frames) for each in both)
-    return slow.sized()[-1] if slow.gain > sudden.gain else None
-
-
-def view_amount(part: Part, camera: Camera) -> Floats:
-    """Return a size as the amount (5,) of a `MeasuredChange`."""
-    amount = np.zeros(WIDTH)
-    if part.kind == "clock":
-        amount[4] = part.size[0]
-    else:
-        x, y, roll, growth = part.size
-        fx, fy = camera.focal
-        amount[:4] = fx * y, -fy * x, math.expm1(growth), roll
-    return amount
-
-
-def view_size(amount: Floats, camera: Camera) -> tuple[float, ...]:
-    """Return the size of a part by the amount of a view, shift, zoom and roll."""
-    x, y, zoom, roll = amount / [*camera.focal, 1.0, 1.0]
-    return float(-y), float(x), float(roll), math.log1p(zoom)
 
 
 def on_common_clock(parts: Sequence[Part]) -> list[Part]:
@@ -271,33 +234,6 @@ def find_sway(
     if size < 1.2e-3 or gain < 8.0 * usual:
         return None
     return camera, bool(gain > 64.0 * usual)
-
-
-def drifts_in_place(
-    add_up: Callable[..., ChangeSums], parts: Sequence[Part], drift: Part, frames: int, fps: float
-) -> bool:
-    """Return whether a view drifts at all its places, far more than those of the other cameras.
-
-    Args:
-        add_up: `sum_clip` for the people.
-        parts: the other parts.
-        drift: of the view.
-        frames: of the clip.
-        fps: rows per second [1/s].
-    """
-    side, least_s = 6, 2.0  # errors of poses last for less
-    length = max(1, math.ceil(frames / 24), round(least_s * fps))
-
-    def measure(camera: int, taken_back: Sequence[Part]) -> tuple[float, int]:
-        sums = add_up(taken_back, bins=(length, max(1, frames // 400), camera, side))
-        return sums.drift_in_place(camera, side**2)
-
-    far, free = measure(drift.camera, parts)
-    others = {part.camera for part in parts} - {drift.camera}
-    usual = np.median([measure(c, [*parts, drift])[0] for c in others])
-    noise = max(1.0, float(usual / fdtri(4, free, 0.5)))
-    # Of ten thousand cameras that stay, one is told.
-    return bool(fdtrc(4, free, far / noise) < 1e-4)
 
 
 def spreads(sums: ChangeSums, parts: Sequence[Part], frames: int) -> list[Floats]:
@@ -391,7 +327,7 @@ class _Fit:
         """Return the noise of what is left."""
         return replace(self.sums, score=self.left).noise()
 
-    def clearness(self, k: int, noise: Noise, steady: Collection[int]) -> float:
+    def clearness(self, k: int, noise: Noise) -> float:
         """Return how far a part is beyond the noise, over the least that counts [1]."""
         part = self.sized()[k]
         if part.shape == "constant":
@@ -401,7 +337,7 @@ class _Fit:
         usual = noise[part.kind, part.shape == "drift"][part.camera]
         own = self.sizes_of(k)
         spread = MIN_GAIN[part.kind] * usual * self.covariance[own, own]
-        if part.name in [(c, "view", "drift") for c in steady]:
+        if part.kind == "view" and part.shape == "drift":
             # People who walk through the view meet its constant errors one after the other.
             spread = spread + np.diag(4.0 / np.array(PRIOR))
         size = self.sizes[own]
@@ -427,23 +363,27 @@ class _Fit:
         """Return the part that lowers the sum of squares most, in variances of the usual noise."""
         noise, best, most = self.noise(), None, 0.0
         for c, kind in product(range(self.sums.cameras), kinds):
-            part, gain = self._best(c, kind)
-            clear = gain / float(np.median(noise[kind, part.shape == "drift"]))
-            if clear > most and gain > MIN_GAIN[kind]:
-                best, most = part, clear
+            for part, gain in self._candidates(c, kind):
+                clear = gain / float(np.median(noise[kind, part.shape == "drift"]))
+                if clear > most and gain > MIN_GAIN[kind]:
+                    best, most = part, clear
         return best
 
-    def _best(self, camera: int, kind: Kind) -> tuple[Part, float]:
-        """Return the drift or the step of a camera with the largest gain, and that."""
+    def _candidates(self, camera: int, kind: Kind) -> list[tuple[Part, float]]:
+        """Return a drift and the best steps of a camera, with their gains."""
         rows, own = self.sums.rows, Part(camera, "step", 0, (0.0,) * len(UNKNOWNS[kind]))
         length = np.diff(rows).min() if len(rows) > 1 else 1.0
         jumps = replace(self.sums, score=self.left).steps(camera, kind)
         others = [part.row for part in self.parts if part.name == own.name]
         far = np.abs(rows[:, None] - np.array([*others, np.inf])).min(axis=1) > self.sums.fps
-        starts = np.ceil(rows[np.isfinite(jumps) & far] - 0.5 * length).astype(int)
+        inner = np.flatnonzero(np.isfinite(jumps) & far)
+        starts = np.ceil(rows[inner] - 0.5 * length).astype(int)
         parts = [replace(own, shape="drift"), *(replace(own, row=int(row)) for row in starts)]
         gains = self._gains(parts)
-        return parts[int(np.argmax(gains))], float(gains.max())
+        chosen = [0]
+        if len(inner):
+            chosen += {1 + int(np.argmax(gains[1:])), 1 + int(np.argmax(jumps[inner]))}
+        return [(parts[k], float(gains[k])) for k in chosen]
 
     def _gains(self, candidates: Sequence[Part]) -> Floats:
         """Return the gains (n,) of further parts of one kind and camera."""

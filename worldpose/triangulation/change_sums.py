@@ -70,7 +70,9 @@ class ChangeSums:
         middles = np.concatenate([np.zeros(0), *(one.rows for one in parts)])
         # Two stretches may share a bin.
         rows, number = np.unique(middles, return_inverse=True)
-        matrix, score = (_add_up(each, number, len(rows)) for each in (every, pulls))
+        matrix, score = np.zeros((len(rows), *every.shape[1:])), np.zeros((len(rows), size))
+        np.add.at(matrix, number, every)
+        np.add.at(score, number, pulls)
         return cls(matrix, score, rows, fps, cameras.focal.mean(axis=-1))
 
     @property
@@ -145,38 +147,6 @@ class ChangeSums:
         shift = cameras.focal.mean(axis=-1) * np.hypot(off[..., 1], off[..., 2])
         return np.stack([shift, off[..., 0]], axis=-1)
 
-    def drift_in_place(self, camera: int, places: int) -> tuple[float, int]:
-        """Return F of a view's drift over the clip, and the second of its degrees of freedom.
-
-        Each place of the image has a constant error of its own, so that people who walk do not show
-        a drift. Its covariance is that of what the blocks of time leave.
-
-        Args:
-            camera: index.
-            places: into how many parts the image is cut, as `sum_joints` numbered them.
-        """
-        matrix, score = self.of_camera(camera, "view")
-        block, place = np.divmod(self.rows.astype(int), places)
-        blocks, width = int(block.max(initial=0)) + 1, score.shape[1]
-        time, prior = (block + 0.5) / blocks - 0.5, np.diag(PRIOR)
-        constant = np.linalg.inv(_add_up(matrix, place, places) + prior)
-        follows = constant @ _add_up(time[:, None, None] * matrix, place, places)
-        own = (constant @ _add_up(score, place, places)[..., None])[..., 0]
-        columns = time[:, None, None] * np.eye(width) - follows[place]
-        held = columns.swapaxes(1, 2) @ matrix
-        total = np.einsum("bij,bjk->ik", held, columns)
-        total += np.einsum("pji,jk,pkl->il", follows, prior, follows)
-        inverse = np.linalg.inv(total + 1e-2 * prior)
-        left = score - (matrix @ own[place][..., None])[..., 0]
-        drift = inverse @ (time @ left)
-        left -= (matrix @ (columns @ drift)[..., None])[..., 0]
-        pull = _add_up((columns.swapaxes(1, 2) @ left[..., None])[..., 0], block, blocks) @ inverse
-        free = blocks - width - 1
-        if free < 1:
-            return 0.0, 1
-        spread = pull.T @ pull * (width * blocks / free)  # 0 of a camera that sees nobody
-        return float(drift @ np.linalg.pinv(spread, hermitian=True) @ drift), free
-
     def sway(self, camera: int) -> tuple[float, float]:
         """Return the usual size of a view's change in a second [rad], and its gain [1]."""
         own = WIDTH * camera + np.arange(WIDTH)
@@ -225,12 +195,6 @@ _INFORMATION: Final = 1e-2 * np.array([1e-2, *PRIOR])
 """Weak information on the unknowns of a camera in a block of bins."""
 
 
-def _add_up(values: Floats, group: Integers, count: int) -> Floats:
-    out = np.zeros((count, *values.shape[1:]))
-    np.add.at(out, group, values)
-    return out
-
-
 def _median(values: Floats) -> float:
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else 0.0
@@ -254,7 +218,7 @@ def sum_joints(
     joints: Floats,
     start: int,
     fps: float,
-    bins: tuple[int, ...],
+    bins: tuple[int, int],
     settings: TriangulationSettings = LOOSE,
 ) -> ChangeSums:
     """Return the equations of a chunk of a clip; its first and last rows give velocities only.
@@ -265,11 +229,10 @@ def sum_joints(
         joints: (frames, persons, 17, 3) triangulated [m], world.
         start: row of the first of these frames in the clip.
         fps: rows per second [1/s].
-        bins: as of `choose_bins`. A camera and a number may follow: each bin is cut into the parts
-            of that camera's image, as many along each side, and rows number them.
+        bins: as of `choose_bins`.
         settings: accepted deviations.
     """
-    (length, every, *places), limbs = bins, np.full_like(joints, np.nan)
+    (length, every), limbs = bins, np.full_like(joints, np.nan)
     limbs[:, :, LIMBS] = joints[:, :, LIMBS]
     rows = choose_rows(len(joints), start, fps, every)
     people = shift_in_time(seen[rows], np.zeros(1))
@@ -278,14 +241,8 @@ def sum_joints(
     if not len(moving.at):
         return ChangeSums.join([], cameras, fps)
     number = (start + moving.frame) // length
-    if places:
-        camera, count = cameras[places[0]], places[1]
-        part = np.nan_to_num(camera.project(moving.at) / camera.image_size) * count
-        number = number * count**2 + np.clip(part, 0, count - 1).astype(int) @ [count, 1]
     added = sum_equations(replace(moving, person=number), with_cameras=True)
-    middles = np.asarray(np.unique(number), np.float64)
-    if not places:
-        middles = middles * length + 0.5 * (length - 1)
+    middles = np.asarray(np.unique(number) * length + 0.5 * (length - 1), np.float64)
     return ChangeSums(added.information, added.score, middles, fps, cameras.focal.mean(axis=-1))
 
 

@@ -22,7 +22,7 @@ from worldpose.triangulation.camera_changes import (
     refine_change,
     sum_clip,
 )
-from worldpose.triangulation.change_parts import Part, drifts_in_place, fit_parts
+from worldpose.triangulation.change_parts import Part, fit_parts
 from worldpose.triangulation.change_sums import ChangeSums
 from worldpose.triangulation.clock_courses import (
     add_slow_drifts,
@@ -175,39 +175,6 @@ def test_the_changed_camera_is_named_and_measured(cameras, spoil, row, amount):
         np.testing.assert_allclose(found.amount[2:4], amount[2:], atol=0.005)
     else:
         assert found.amount[4] == pytest.approx(amount, abs=0.25)
-
-
-def minute(cameras, sunk, apart=0.0, error=0.0):
-    """A minute of people who go apart [m], as a view that sinks [px] sees them.
-
-    It has a constant error at the left and right of its image [px], and none in the middle.
-    """
-    joints, frame = runner(3000, 3)[::5], np.arange(600)
-    way = joints[..., :2].mean(axis=2, keepdims=True)
-    way /= np.linalg.norm(way, axis=-1, keepdims=True)
-    joints[..., :2] += np.linspace(0.0, apart, 600)[:, None, None, None] * way
-    pixels, confidence, index = detections(cameras, joints, 1.0)
-    middle = cameras[BAD].image_size[0] / 2
-    wrong = error * np.abs(pixels[:, BAD, ..., 0] / middle - 1.0)
-    pixels[:, BAD, ..., 1] += wrong + sunk * frame[:, None, None] / 599
-    return KeypointDetections.from_keypoints(pixels, confidence, index, frame)
-
-
-def test_a_view_that_sinks_a_twentieth_of_a_degree_in_a_minute_is_found(cameras):
-    people, rows = minute(cameras, 1.3), np.arange(600)
-    sums = sum_clip(cameras, people, FPS / 5, rows)
-    (found,) = find_changes(cameras, people, FPS / 5, rows, sums, ("view",))
-    assert (found.camera, found.row) == (BAD, None)
-    np.testing.assert_allclose(found.amount[:2], [0.0, 1.3], atol=0.2)
-
-
-@pytest.mark.parametrize(("sunk", "error"), [(0.0, 5.0), (2.0, 0.0)])
-def test_people_who_go_apart_show_no_drift_by_the_errors_of_a_view(cameras, sunk, error):
-    people = minute(cameras, sunk, 7.0, error)
-    add_up = partial(sum_clip, cameras, people, FPS / 5, np.arange(600))
-    constants = [Part(c, "constant", 0, (0.0,)) for c in range(4)]
-    seeming = Part(BAD, "drift", 0, (-2.0 / 1520.0, 0.0, 0.0, 0.0))
-    assert drifts_in_place(add_up, constants, seeming, 600, FPS / 5) == (sunk > 0.0)
 
 
 def test_all_frames_tell_when_a_view_steps_between_sampled_ones(cameras):
@@ -376,27 +343,16 @@ def test_a_known_change_is_taken_back_within_its_clip(change, moved):
     assert not shift[:, 0].any()
 
 
-@pytest.mark.parametrize(
-    ("spoil", "told", "frame", "shift"),
-    [
-        (sink, {"frame": None, "shift_px": (0.0, 12.0)}, None, (0.0, 20.0)),
-        (sink, {"frame": 150, "shift_px": (0.0, 15.0)}, None, (0.0, 20.0)),
-        (knock(90.0, 40.0), {"frame": 120, "shift_px": (84.0, 44.0)}, 120, (90.0, 40.0)),
-    ],
-    ids=["sinking", "sinking, told as a knock", "knocked"],
-)
-def test_people_in_the_whole_clip_tell_a_slow_change_from_a_knock(
-    cameras, spoil, told, frame, shift
-):
-    update = {"camera": "a", "first_frame": 0, "frame_count": FRAMES}
-    known = KNOCK.model_copy(update=update | told)
-    people = view(cameras, spoil)
+def test_what_people_show_of_a_slow_change_is_that_of_the_whole_clip(cameras):
+    update = {"camera": "a", "frame": None, "first_frame": 0, "frame_count": FRAMES}
+    known = KNOCK.model_copy(update=update | {"shift_px": (0.0, 12.0)})
+    people = view(cameras, sink)
     pixels = np.array(people.keypoints)
     own = pixels[:, [BAD]]
     pixels[:, [BAD]] = correct_views(own, people.frame, {"a": cameras[BAD]}, [known])
     found = refine_change(cameras, replace(people, keypoints=pixels), FPS, BAD, known)
-    assert found.frame == frame
-    np.testing.assert_allclose(found.shift_px, shift, atol=1.0)
+    assert found.frame is None
+    np.testing.assert_allclose(found.shift_px, [0.0, 20.0], atol=0.6)
 
 
 def test_a_far_knock_and_what_its_correction_leaves_are_one_motion():
