@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from data_contracts import release as contracts
+from data_contracts.arrays import Floats
 from flows.results import best_results
 from flows.results.best_results import Origin
 from worldpose.body_fitting.bones import Shape
@@ -41,15 +42,29 @@ def name_subjects(
 def subject_fits(
     label: str, subjects: Sequence[str], origin: Origin, clip: str
 ) -> Iterator[SubjectFit]:
-    """Yield the shapes of a clip's people by its static cameras, without those of other clips."""
+    """Yield a clip's shapes by its static cameras, without other clips, in the order of subjects.
+
+    People whom only the broadcast camera films have no betas.
+    """
     run, unit = origin.run, f"body_fitting/{clip}"
-    if unit not in run:
-        return
-    settings = BodyFittingSettings.model_validate(run.record.settings["body_fitting"])
-    rows = run[best_results.bodies_unit(run, clip)]["person"].values.tolist()
-    subject_of = dict(zip(rows, subjects, strict=True))
-    arrays = (run[unit][each].values for each in ("person", "betas", "betas_covariance"))
-    for person, *shape in zip(*arrays, strict=True):
-        if (who := subject_of.get(person)) and np.isfinite(shape[0]).all():
-            model = str(run[unit].attrs["body_model"])
-            yield SubjectFit(who, model, label, Shape(*shape), settings.prior_weight)
+    bodies = run[best_results.bodies_unit(run, clip)]
+    weight = 0.0
+    found: dict[object, tuple[Floats, Floats]] = {}
+    if unit in run:
+        # Other settings of an older run may be none of today's.
+        settings = run.record.settings["body_fitting"]
+        stated = settings.get("shape_weight", BodyFittingSettings().shape_weight)
+        weight = 0.0 if settings.get("method") == "paper" else stated
+        if not isinstance(weight, int | float) or weight < 0.0:
+            where = f"run {run.record.run_id}: settings of body_fitting: shape_weight"
+            raise wrong(where, "a number", f"{weight!r}", "Run the match again.")
+        arrays = (run[unit][each].values for each in ("person", "betas", "betas_covariance"))
+        found = {person: (betas, spread) for person, betas, spread in zip(*arrays, strict=True)}
+    model = str(bodies.attrs["body_model"])
+    people = bodies["person"].values, bodies["betas"].values, subjects
+    for person, best, subject in zip(*people, strict=True):
+        betas, spread = found.get(person, (np.full(1, np.nan), np.empty(0)))
+        is_known = bool(np.isfinite(betas).all() and np.isfinite(spread).all())
+        shape = Shape(betas, spread) if is_known else Shape(np.empty(0), np.empty((0, 0)))
+        is_best = is_known and np.array_equal(betas, best)
+        yield SubjectFit(subject, model, label, shape, float(weight), is_best)

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from faulty_data_sets import (
-    COVARIANCE,
     FPS,
     HALF,
     PERSONS,
@@ -25,10 +24,9 @@ from flows.results.data_set_release import ASSETS, check_data_set, write_data_se
 from worldpose.body.body_file import save_body
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.occlusions import hidden_joints, visible_shares
-from worldpose.body_fitting.bones import Shape
 from worldpose.dataset.benchmark import score_folders
 from worldpose.dataset.manifest import read_data_set, read_rigs, released_files
-from worldpose.dataset.subjects import SubjectFit, read_subjects, write_subjects
+from worldpose.dataset.subjects import read_subjects
 from worldpose.errors import InputError, UsageError
 from worldpose.store.runs import list_pins
 from worldpose.store.store import Store
@@ -123,27 +121,6 @@ def test_two_bodies_of_one_name_are_refused(model, origins, tmp_path):
 def replace_match(registration, match):
     spec = registration.spec.model_copy(update={"match_id": match})
     return SimpleNamespace(**vars(registration) | {"spec": spec})
-
-
-def test_a_subject_has_a_shape_of_each_body_model_and_never_a_mean_of_two(tmp_path):
-    def fit(model, clip, first):
-        shape = Shape(np.array([first, *np.zeros(9)]), COVARIANCE)
-        return SubjectFit("keeper", model, clip, shape, 0.5)
-
-    fits = [
-        fit("neutral", "a", 0.4),
-        fit("female", "b", 4.0),
-        fit("neutral", "c", 0.6),
-        SubjectFit("other", "small", "a", Shape(np.ones(4), 0.2 * np.eye(4)), 0.5),
-    ]
-    write_subjects(tmp_path / "subjects.npz", fits)
-    rows = {row[:3]: row.shape for row in read_subjects(tmp_path / "subjects.npz")}
-    # Of two clips 2 x 4.5 of information and 0.5 of the prior: 5 (0.4 + 0.6) / 9.5.
-    assert rows["keeper", "neutral", ""].betas[0] == pytest.approx(5.0 / 9.5)
-    np.testing.assert_allclose(rows["keeper", "neutral", ""].covariance, np.eye(10) / 9.5)
-    assert rows["keeper", "female", ""].betas[0] == pytest.approx(4.0)
-    assert rows["other", "small", ""].betas.shape == (4,)
-    assert len(rows) == 3 + len(fits)
 
 
 def test_a_sound_data_set_passes_and_hides_the_truth(model, written):
@@ -392,6 +369,17 @@ FAULTS = {
         files("train/subjects.npz", put("betas", (0, 3), 0.7)),
         "shape_differs",
         "train/subjects.npz",
+    ),
+    "missing row of a clip": (
+        files("train/subjects.npz", lambda a: a.update({k: v[:-1] for k, v in a.items()})),
+        "subjects_differ",
+        "train/subjects.npz",
+    ),
+    # The pooled shape, row 0, is that of this clip alone.
+    "scaled rows of a subject": (
+        files("train/subjects.npz", lambda a: a["betas"].__imul__(1.1)),
+        "shape_differs",
+        "ann-1/A/1",
     ),
     "pooled over body models": (
         files("train/subjects.npz", put("body_models", -1, "smpl-male")),
