@@ -202,11 +202,11 @@ def _write_clip(
     changes, still = view_changes(origin.run, clip), dict[str, contracts.RigCamera]()
     for camera_id, filmed in origin.static_cameras.items():
         own = tuple(each for each in changes if each.camera == camera_id)
-        visible, camera = None, rig[0].get(camera_id)
-        if camera is not None:
+        visible, brown = None, rig[0].get(camera_id)
+        if brown is not None:
             path = part / "cameras" / name / f"{camera_id}.npz"
-            release_cameras.write_static_camera(path, camera.to_calibration(camera_id))
-            visible = None if own else mean_visible(tracks.joints, camera)
+            release_cameras.write_static_camera(path, brown.to_calibration(camera_id))
+            visible = None if own else mean_visible(tracks.joints, brown)
         width, height = filmed.image_size.tolist()
         still[camera_id] = contracts.RigCamera(
             image_size=(width, height), visible=visible, lens=rig[1].get(camera_id), changes=own

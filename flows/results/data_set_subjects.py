@@ -53,11 +53,11 @@ def subject_fits(
     if unit in run:
         # Other settings of an older run may be none of today's.
         settings = run.record.settings["body_fitting"]
-        stated = settings.get("shape_weight", BodyFittingSettings().shape_weight)
-        weight = 0.0 if settings.get("method") == "paper" else stated
-        if not isinstance(weight, int | float) or weight < 0.0:
+        stated: object = settings.get("shape_weight", BodyFittingSettings().shape_weight)
+        if not isinstance(stated, int | float) or stated < 0.0:
             where = f"run {run.record.run_id}: settings of body_fitting: shape_weight"
-            raise wrong(where, "a number", f"{weight!r}", "Run the match again.")
+            raise wrong(where, "a number", f"{stated!r}", "Run the match again.")
+        weight = 0.0 if settings.get("method") == "paper" else float(stated)
         arrays = (run[unit][each].values for each in ("person", "betas", "betas_covariance"))
         found = {person: (betas, spread) for person, betas, spread in zip(*arrays, strict=True)}
     model = str(bodies.attrs["body_model"])
@@ -67,4 +67,4 @@ def subject_fits(
         is_known = bool(np.isfinite(betas).all() and np.isfinite(spread).all())
         shape = Shape(betas, spread) if is_known else Shape(np.empty(0), np.empty((0, 0)))
         is_best = is_known and np.array_equal(betas, best)
-        yield SubjectFit(subject, model, label, shape, float(weight), is_best)
+        yield SubjectFit(subject, model, label, shape, weight, is_best)

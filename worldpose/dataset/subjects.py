@@ -137,7 +137,7 @@ def _other_bodies(
         betas = read_poses(path)[0].betas
     except InputError:  # the check of the clip tells it
         return
-    betas = betas.reshape(len(betas), -1, betas.shape[-1])[:, 0]
+    betas = betas[:, 0] if betas.ndim == 3 else betas
     own: dict[str, list[SubjectFit]] = {}
     for row in reversed([row for row in rows if row.clip == name]):
         own.setdefault(row.subject, []).append(row)
