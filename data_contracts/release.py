@@ -218,9 +218,11 @@ class RigCamera(Record):
     image_size: tuple[ImageLength, ImageLength]
     """Width and height [px]."""
     visible: Share | None
-    """Mean share of a person's joints that it shows [1]; None without people."""
+    """Mean share of a person's joints that it shows [1]; None without people, or if the view
+    changes."""
     lens: dict[str, str | Number | None] | None = None
-    """Model of another lens than Brown's, and the largest errors of the five coefficients [px]."""
+    """Model of another lens than Brown's, and the largest errors of the five coefficients [px]; if
+    they are null, the `reason` why the camera has no file."""
     changes: tuple[CameraChange, ...] = ()
     """How the view changes within the clip; the camera's file is from before."""
 
@@ -246,8 +248,8 @@ class ReleasedSequence(Record):
     """The person of each row of poses, joints and boxes: the same name is the same person."""
     views: dict[str, tuple[ImageLength, ImageLength]]
     """Width and height [px] of each broadcast camera's images, by the name of its files."""
-    rig: dict[Name, RigCamera]
-    """Static cameras."""
+    rig: dict[Name, RigCamera] | None = None
+    """Static cameras; None in older releases, and in the test part, whose truth has rigs.json."""
     footage: dict[str, StoredFile]
     """Video by the same names: the copy, or the file in the match folder."""
     first_images: dict[str, Frame]

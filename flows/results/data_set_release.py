@@ -20,25 +20,23 @@ from data_contracts.conventions import COCO17
 from data_contracts.run import StoredFile
 from flows.results import best_results
 from flows.results.best_results import Origin
+from flows.results.data_set_subjects import name_subjects, subject_fits
 from flows.results.dataset import check, count
 from flows.results.export import keep_run
-from flows.results.run_cameras import view_changes, with_brown_lenses
+from flows.results.run_cameras import Lens, followed_lenses, view_changes
 from flows.results.tool_exports import filmed_cameras
 from worldpose.body.body_file import find_body
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BodyModel
 from worldpose.body.occlusions import visible_shares
-from worldpose.body_fitting.bones import Shape
-from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.dataset import manifest as manifests
 from worldpose.dataset.contents import camera_files
 from worldpose.dataset.plausibility import mean_visible, rig_findings
 from worldpose.dataset.statistics import clip_statistics, data_set_statistics, read_places
-from worldpose.dataset.subjects import SubjectFit, subject_findings, write_subjects
+from worldpose.dataset.subjects import subject_findings, write_subjects
 from worldpose.errors import InputError, UsageError
 from worldpose.formats import challenge, joints_file, release_cameras
 from worldpose.formats.archives import Member, read_archive, write_archive, wrong
-from worldpose.formats.files import read_yaml
 from worldpose.geometry.cameras import Camera
 from worldpose.ingest.footage import unit_frames
 from worldpose.ingest.match_folder import read_match
@@ -94,7 +92,7 @@ def write_data_set(
         sources: dict[Path, list[tuple[str, tuple[Origin, str]]]] = {}
         for origin, split in origins:
             part = truth if split == "test" else draft / split
-            rig = with_brown_lenses(origin.static_cameras, f"release of {origin.spec.match_id}")
+            rig = followed_lenses(origin.static_cameras, f"release of {origin.spec.match_id}")
             for clip in origin.clips:
                 label = f"{origin.spec.match_id}_{clip}".replace(".", "_")
                 if label in clips:
@@ -109,10 +107,14 @@ def write_data_set(
                     todo = "Install them under different names, and run a match again."
                     raise _refuse(model.name, "one body file of this name", "two", todo)
                 sources.setdefault(part, []).append((label, (origin, clip)))
-        clips = _name_subjects(clips, subjects)
+        clips = name_subjects(clips, subjects)
         for part, of in sources.items():
-            fits = (_fits(label, clips[label].subjects, *where) for label, where in of)
+            fits = (subject_fits(label, clips[label].subjects, *where) for label, where in of)
             write_subjects(part / "subjects.npz", chain.from_iterable(fits))
+        if tested:
+            secrets = {name: clip for name, clip in clips.items() if clip.split == "test"}
+            manifests.write_rigs(truth, {name: clip.rig or {} for name, clip in secrets.items()})
+            clips |= {name: clip.model_copy(update={"rig": None}) for name, clip in secrets.items()}
         parts = [part for part in (draft / "train", draft / "val", truth) if part.is_dir()]
         counted = {part: count([part]) for part in parts}
         if tested:
@@ -162,21 +164,6 @@ def _listed(folder: Path) -> tuple[StoredFile, ...]:
     return manifests.released_files(folder, [path for path in folder.rglob("*") if path.is_file()])
 
 
-def _fits(label: str, subjects: Sequence[str], origin: Origin, clip: str) -> Iterator[SubjectFit]:
-    """Yield the shapes of a clip's people by its static cameras, without those of other clips."""
-    run, unit = origin.run, f"body_fitting/{clip}"
-    if unit not in run:
-        return
-    settings = BodyFittingSettings.model_validate(run.record.settings["body_fitting"])
-    rows = run[best_results.bodies_unit(run, clip)]["person"].values.tolist()
-    subject_of = dict(zip(rows, subjects, strict=True))
-    arrays = (run[unit][each].values for each in ("person", "betas", "betas_covariance"))
-    for person, *shape in zip(*arrays, strict=True):
-        if (who := subject_of.get(person)) and np.isfinite(shape[0]).all():
-            model = str(run[unit].attrs["body_model"])
-            yield SubjectFit(who, model, label, Shape(*shape), settings.prior_weight)
-
-
 def _write_clip(
     origin: Origin,
     clip: str,
@@ -184,7 +171,7 @@ def _write_clip(
     split: contracts.Split,
     root: Path,
     footage: FootageForm,
-    rig: tuple[Mapping[str, Camera], Mapping[str, Mapping[str, str | float | None]]],
+    rig: tuple[Mapping[str, Camera], Mapping[str, Lens]],
 ) -> tuple[contracts.ReleasedSequence, BodyModel]:
     """Write the files of one clip below `root`, the truth of a test part apart from the rest.
 
@@ -213,15 +200,16 @@ def _write_clip(
             videos[label] = _write_footage(origin, view, public / "footage" / label, footage)
             images[label] = unit_frames(spec, view).number(spec.clips_of(view)[0].first_frame)
     changes, still = view_changes(origin.run, clip), dict[str, contracts.RigCamera]()
-    for camera_id, camera in rig[0].items():
-        path = part / "cameras" / name / f"{camera_id}.npz"
-        release_cameras.write_static_camera(path, camera.to_calibration(camera_id))
-        width, height = camera.image_size.tolist()
+    for camera_id, filmed in origin.static_cameras.items():
+        own = tuple(each for each in changes if each.camera == camera_id)
+        visible, brown = None, rig[0].get(camera_id)
+        if brown is not None:
+            path = part / "cameras" / name / f"{camera_id}.npz"
+            release_cameras.write_static_camera(path, brown.to_calibration(camera_id))
+            visible = None if own else mean_visible(tracks.joints, brown)
+        width, height = filmed.image_size.tolist()
         still[camera_id] = contracts.RigCamera(
-            image_size=(width, height),
-            visible=mean_visible(tracks.joints, camera),
-            lens=rig[1].get(camera_id),
-            changes=tuple(each for each in changes if each.camera == camera_id),
+            image_size=(width, height), visible=visible, lens=rig[1].get(camera_id), changes=own
         )
     found = best_results.tracked_people(origin.run, clip)[1]
     named = {person: track.name or f"{clip}/{person}" for person, track in found.items()}
@@ -281,27 +269,6 @@ def project_people(
     return {"boxes": boxes, "visibility": visible_shares(joints, camera)}
 
 
-def _name_subjects(
-    clips: Mapping[str, contracts.ReleasedSequence], file: Path | None
-) -> dict[str, contracts.ReleasedSequence]:
-    """Return the clips with the subjects of a registry."""
-    registry = {} if file is None else read_yaml(file)
-    known = {person for clip in clips.values() for person in clip.subjects}
-    owner: dict[str, str] = {}
-    for subject, people in registry.items() if isinstance(registry, dict) else [("", None)]:
-        for person in people if isinstance(people, list) else [people]:
-            if person not in known or person in owner:
-                expected = "a list of MATCH/NAME or MATCH/CLIP/ID of the data set, each once"
-                todo = f"Known are {', '.join(sorted(known)[:8])}, ..."
-                raise wrong(f"{file}: {subject}", expected, f"{person!r}", todo)
-            owner[person] = str(subject)
-    named = {}
-    for name, clip in clips.items():
-        subjects = tuple(owner.get(person, person) for person in clip.subjects)
-        named[name] = clip.model_copy(update={"subjects": subjects})
-    return named
-
-
 def _count_public(
     counted: Mapping[str, contracts.ClipStatistics], clips: Mapping[str, contracts.ReleasedSequence]
 ) -> contracts.DataSetStatistics:
@@ -323,11 +290,30 @@ def check_data_set(folder: Path, hidden: Path | None = None) -> contracts.CheckR
     figures: dict[str, contracts.ClipFigures] = {}
     rigs: dict[tuple[str, str], bytes] = {}
     parts: dict[str, Path | None] = {**{s: folder / s for s in ("train", "val")}, "test": hidden}
-    for split, part in parts.items():
-        own = {name: clip for name, clip in manifest.clips.items() if clip.split == split}
-        if part is not None and own:
-            findings += subject_findings(part, own)
+    clips = dict(manifest.clips)
     for name, clip in manifest.clips.items():
+        if clip.split == "test" and clip.rig is not None:
+            says = "release.json states the rig of a hidden clip"
+            findings.append(_damage("test_truth", says, name))
+    try:
+        secrets = None if hidden is None else manifests.read_rigs(hidden)
+    except InputError as error:
+        secrets = {}
+        findings.append(_damage("unreadable", str(error), "test: rigs.json"))
+    for name, clip in clips.items():
+        if clip.split == "test":
+            rig = None if secrets is None else secrets.get(name, {})
+            clips[name] = clip.model_copy(update={"rig": rig})
+    for split, part in parts.items():
+        own = {name: clip for name, clip in clips.items() if clip.split == split}
+        files = manifest.hidden if split == "test" else manifest.files
+        told = {file.path for file in files}
+        listed = f"{'' if split == 'test' else f'{split}/'}subjects.npz" in told
+        # Older releases have neither rigs nor shapes of subjects.
+        is_older = not listed and all(clip.rig is None for clip in own.values())
+        if part is not None and own and not (is_older and not (part / "subjects.npz").exists()):
+            findings += subject_findings(part, own)
+    for name, clip in clips.items():
         part = parts[clip.split]
         try:
             findings += _view_findings(folder / clip.split, part, name, clip)

@@ -323,14 +323,16 @@ def export(
     match_id = origin.spec.match_id
 
     def claim(folder: Path, drafts: Mapping[str, Path]) -> None:
-        own_whole(folder, drafts, _entries(origin), (match_id,), overwrite=overwrite)
+        own_whole(
+            folder,
+            drafts,
+            best_results.all_clips(origin.run),
+            (match_id,),
+            overwrite=overwrite,
+            cameras=origin.static_cameras,
+        )
 
     return write_whole(out, write, claim)
-
-
-def _entries(origin: best_results.Origin) -> list[str]:
-    """Return the clips and cameras of which shared files tell."""
-    return [*best_results.all_clips(origin.run), *origin.static_cameras]
 
 
 def forms_without_people(run: Run, spec: MatchSpec) -> tuple[str, ...]:
@@ -440,7 +442,15 @@ def release(
     def claim(folder: Path, drafts: Mapping[str, Path]) -> None:
         released = f"{RELEASE}{name} of {spec.match_id}"
         owners = released, spec.match_id
-        own_whole(folder, drafts, _entries(origin), owners, overwrite=False, record=False)
+        own_whole(
+            folder,
+            drafts,
+            best_results.all_clips(origin.run),
+            owners,
+            overwrite=False,
+            record=False,
+            cameras=origin.static_cameras,
+        )
 
     return write_whole(out, lambda place: _write_release(origin, forms, place, ours), claim)
 

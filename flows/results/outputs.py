@@ -42,8 +42,11 @@ def read_owners(folder: Path) -> dict[str, str]:
     manifest = read_manifest(folder)
     if manifest is not None:
         files = {file.path for file in manifest.files}
-        of = {*manifest.clips, *manifest.pictures}
-        entries = (f"{name}: {each}" for name in SHARED & files for each in of)
+        entries = (
+            f"{name}: {each}"
+            for name in SHARED & files
+            for each in (manifest.pictures if name == LENS_ERRORS else manifest.clips)
+        )
         released = (MANIFEST, *files, *entries)
         owners |= dict.fromkeys(released, f"{RELEASE}{manifest.release} of {manifest.match_id}")
     return owners
@@ -83,11 +86,12 @@ def own_whole(
     *,
     overwrite: bool,
     record: bool = True,
+    cameras: Collection[str] = (),
 ) -> None:
     """Record the first owner of files and of clips' entries in shared ones; or refuse.
 
     An entry counts for all files of a clip of this name, so equal ones have several owners; its
-    name is `FILE: CLIP`.
+    name is `FILE: CLIP`, or `FILE: CAMERA` for lens errors. Without it, the file's owner counts.
     """
     files = {name: draft for name, draft in drafts.items() if name not in SHARED}
     require_own(folder, files, owners, overwrite=overwrite)
@@ -96,15 +100,17 @@ def own_whole(
         path = folder / name
         both = (path, drafts[name])
         old, new = (json.loads(file.read_bytes()) if file.is_file() else {} for file in both)
-        for clip in sorted(new.keys() & set(clips)):
-            before = known.get(f"{name}: {clip}", "unknown origin") if clip in old else owners[0]
+        for clip in sorted(new.keys() & set(cameras if name == LENS_ERRORS else clips)):
+            before = known.get(name, "unknown origin") if clip in old else owners[0]
+            before = known.get(f"{name}: {clip}", before) if clip in old else before
             other, same = before not in owners, old.get(clip, new[clip]) == new[clip]
             if other and not same and (not overwrite or before.startswith(RELEASE)):
                 raise InputError(
                     f"{path}: {clip}",
-                    expected=f"{new[clip]}, or no files of another match's clip of this name",
+                    expected=f"{new[clip]}, or no clip or camera of this name of another match",
                     found=f"{old[clip]}, of {before}",
-                    todo="Choose another folder, or rename the clip. Nothing was written.",
+                    todo="Choose another folder, or rename the clip or camera. "
+                    "Nothing was written.",
                 )
             all_ = before if owners[0] in before.split(" and ") else f"{before} and {owners[0]}"
             found[f"{name}: {clip}"] = all_ if same else owners[0]

@@ -8,6 +8,7 @@ from data_contracts.arrays import Integers
 from data_contracts.match import MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.triangulation import CameraChange
+from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera, camera_from_arrays
 from worldpose.geometry.lens_fit import fit_brown_lens
 from worldpose.geometry.lens_models import LensModel
@@ -16,6 +17,8 @@ from worldpose.store.store import Run
 
 ADJUSTED = "bundle_adjustment/cameras"
 BROADCAST = "broadcast_calibration/"
+Lens = dict[str, str | float | None]
+"""Model and errors of a lens."""
 TRIANGULATED = ("retriangulation", "triangulation")
 """Stages that place joints and find how cameras change within a clip, the best first."""
 
@@ -101,6 +104,25 @@ def with_brown_lenses(
             found[name], off = fit_brown_lens(camera, f"{where}: {name}")
             errors[name] = {"lens_model": LensModel(int(camera.lens_model)).label, **off}
     return found, errors
+
+
+def followed_lenses(
+    given: Mapping[str, Camera], where: str
+) -> tuple[dict[str, Camera], dict[str, Lens]]:
+    """Return static cameras with Brown's lenses, and errors of those that had another, by id.
+
+    A camera whose lens Brown's model cannot follow is left out, with the reason.
+    """
+    cameras, errors = dict[str, Camera](), dict[str, Lens]()
+    for name, camera in given.items():
+        try:
+            own, off = with_brown_lenses({name: camera}, where)
+        except InputError as error:
+            model = LensModel(int(camera.lens_model)).label
+            errors[name] = {"lens_model": model, "max_error_px": None, "reason": str(error)}
+        else:
+            cameras, errors = cameras | own, errors | off
+    return cameras, errors
 
 
 def _join_calibrated(run: Run, spec: MatchSpec) -> tuple[Venue | None, list[str]]:

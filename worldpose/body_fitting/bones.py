@@ -131,16 +131,17 @@ def fit_shape(model: BodyModel, bones: BoneLengths) -> Shape:
     return Shape(betas, np.linalg.inv(precision).astype(np.float64))
 
 
-def agree(one: Shape, other: Shape) -> bool:
+def agree(one: Shape, other: Shape, level: float = 0.001) -> bool:
     """Return whether two shapes can be one person's, by betas b and covariances C.
 
-        (b1 - b2)' (C1 + C2)^-1 (b1 - b2) <= the 99.9 % quantile of chi^2
+        (b1 - b2)' (C1 + C2)^-1 (b1 - b2) <= the quantile of chi^2 at 1 - level
 
+    `level` is the share of one person's pairs that are refused.
     On simulated clips it was 1 to 2 for one person, and 230 or more for people 18 cm apart.
     """
     away = one.betas - other.betas
     squared = away @ np.linalg.solve(one.covariance + other.covariance, away)
-    return bool(squared <= chdtri(len(away), 0.001))
+    return bool(squared <= chdtri(len(away), level))
 
 
 def pool_shapes(shapes: Sequence[Shape], weights: Sequence[float]) -> Shape:

@@ -14,7 +14,7 @@ from pydantic import PositiveFloat, TypeAdapter, ValidationError
 
 from data_contracts.arrays import Flags
 from data_contracts.records import CONTRACT_VERSION
-from data_contracts.release import DataSetManifest, ReleaseManifest
+from data_contracts.release import DataSetManifest, ReleaseManifest, RigCamera
 from data_contracts.run import StoredFile
 from worldpose.errors import InputError
 from worldpose.formats.archives import write_archive
@@ -80,6 +80,26 @@ def read_data_set(folder: Path) -> DataSetManifest:
     if found is None:
         raise InputError(str(path), expected=expected, found="no such file", todo=todo)
     return found
+
+
+def write_rigs(part: Path, rigs: Mapping[str, Mapping[str, RigCamera]]) -> None:
+    """Write rigs.json, the static cameras of hidden clips."""
+    told = {
+        clip: {name: camera.model_dump(mode="json") for name, camera in rig.items()}
+        for clip, rig in rigs.items()
+    }
+    _write(part / "rigs.json", told)
+
+
+def read_rigs(part: Path) -> dict[str, dict[str, RigCamera]] | None:
+    """Read rigs.json; None in an older release, which has none.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    form = TypeAdapter(dict[str, dict[str, RigCamera]])
+    expected, todo = "the static cameras of hidden clips", "Copy the truth again from its origin."
+    return _read(part / "rigs.json", form, expected, todo)
 
 
 def read_manifest(folder: Path) -> ReleaseManifest | None:

@@ -402,15 +402,19 @@ def rig_findings(
 ) -> Iterator[Finding]:
     """Yield faults of a clip's static cameras; `rigs` has the files of the match's other clips."""
     files = {path.stem: path for path in (part / "cameras" / name).glob("*.npz")}
-    if files.keys() != clip.rig.keys():
+    rig = clip.rig or {}
+    # A camera whose lens Brown's model cannot follow has a reason instead of a file.
+    if files.keys() != {each for each in rig if "reason" not in (rig[each].lens or {})}:
         says = "static cameras are not those of the files"
         yield Finding(fault="views_differ", kind="damage", where=(name,), says=says)
     joints = read_joints(part / f"{name}.joints.npz").joints
-    for each in sorted(files.keys() & clip.rig):
-        camera = read_camera(files[each], clip.rig[each].image_size)
+    for each in sorted(files.keys() & rig):
+        camera = read_camera(files[each], rig[each].image_size)
         content, key = files[each].read_bytes(), (clip.match_id, each)
         same = camera.batch_shape == () and content == rigs.setdefault(key, content)
-        seen, stated = (mean_visible(joints, camera) if same else None), clip.rig[each].visible
+        # The file has the view before its changes, with which later frames must not be projected.
+        is_shown = same and not rig[each].changes
+        seen, stated = (mean_visible(joints, camera) if is_shown else None), rig[each].visible
         if not same or abs((seen or 0.0) - (stated or 0.0)) > 1e-6:
             where = (f"{clip.split}/cameras/{name}/{each}.npz",)
             says = "not the camera of the match's rig, or it shows other people than stated"

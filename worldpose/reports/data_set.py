@@ -75,7 +75,7 @@ def _composition(manifest: DataSetManifest) -> Section:
         "A match belongs to one split, and so does every subject. Nameless people without an entry "
         "in the registry count once per clip. The truth of a test part is hidden: the part has "
         "boxes, and cameras with the pose of the first frame alone. Statistics are without it. "
-        "subjects.npz has a shape of each subject and body model, from all clips of a part."
+        "subjects.npz has a shape of each subject that static cameras film, by body model."
     )
     return Section("Composition", tuple(blocks), lead)
 
@@ -85,16 +85,20 @@ def _static_cameras(manifest: DataSetManifest) -> Table:
     rigs: dict[str, dict[str, RigCamera]] = {}
     changed: dict[str, list[str]] = {}
     for name, clip in manifest.clips.items():
-        rigs.setdefault(clip.match_id, {}).update(clip.rig)
-        moved = (f"{each} in {name}" for each, camera in clip.rig.items() if camera.changes)
+        if clip.split == "test":
+            continue
+        rig = clip.rig or {}
+        rigs.setdefault(clip.match_id, {}).update(rig)
+        moved = (f"{each} in {name}" for each, camera in rig.items() if camera.changes)
         changed.setdefault(clip.match_id, []).extend(moved)
     rows = []
     for match, rig in rigs.items():
         sizes = dict.fromkeys("{} x {}".format(*camera.image_size) for camera in rig.values())
         lenses = (
-            f"{name}: {camera.lens['lens_model']}, {camera.lens['max_error_px']:.2g} px off"
+            f"{name}: {lens['lens_model']}, "
+            + ("left out" if (off := lens["max_error_px"]) is None else f"{off:.2g} px off")
             for name, camera in rig.items()
-            if camera.lens
+            if (lens := camera.lens)
         )
         said = (", ".join(each) or "-" for each in (sizes, lenses, changed[match]))
         rows.append((match, f"{len(rig)}", *said))

@@ -8,8 +8,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import xarray as xr
-from faulty_data_sets import FPS, PERSONS, edit, transpose_rotation
+from faulty_data_sets import (
+    FPS,
+    HALF,
+    PERSONS,
+    edit,
+    results,
+    transpose_rotation,
+)
 from run_records import StubRun, match_spec
 
 from data_contracts.conventions import COCO17
@@ -18,64 +24,15 @@ from flows.results.data_set_release import ASSETS, check_data_set, write_data_se
 from worldpose.body.body_file import save_body
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.occlusions import hidden_joints, visible_shares
-from worldpose.body_fitting.bones import Shape
 from worldpose.dataset.benchmark import score_folders
-from worldpose.dataset.manifest import read_data_set, released_files
-from worldpose.dataset.subjects import SubjectFit, read_subjects, write_subjects
+from worldpose.dataset.manifest import read_data_set, read_rigs, released_files
+from worldpose.dataset.subjects import read_subjects
 from worldpose.errors import InputError, UsageError
 from worldpose.store.runs import list_pins
 from worldpose.store.store import Store
 
-HALF = 8
-"""Frames of a clip."""
-COVARIANCE = 0.2 * np.eye(10)
-"""Of every clip's betas, with a prior of weight 0.5."""
 SPLITS = {"ann-1": "train", "bea-1": "val", "cleo-1": "test"}
 CLIP = "ann-1_A"
-
-
-def results(model, poses, camera, clip, first):
-    """What a run has of one clip: bodies, their joints, tracks and the broadcast camera."""
-    some = poses[:, first : first + HALF]
-    joints = fold_keypoints(model, COCO17)(some).swapaxes(0, 1)
-    frames = np.arange(first, first + HALF)
-    coordinates = {"frame": frames, "person": np.arange(PERSONS)}
-    placed = {
-        "joints": (("frame", "person", "joint", "axis"), joints),
-        "covariance": (("frame", "person", "joint", "axis", "axis_"), np.zeros((*joints.shape, 3))),
-        "views": (("frame", "person", "joint"), np.full(joints.shape[:3], 3)),
-    }
-    fits = {"betas": (("person", "shape"), some.betas[:, 0])}
-    fits["betas_covariance"] = (("person", "shape", "shape_"), np.stack([COVARIANCE] * PERSONS))
-    for name in ("global_orient", "body_pose", "transl"):
-        rows = getattr(some, name).swapaxes(0, 1)
-        fits[name] = (("frame", "person", f"{name}_"), rows)
-    tracks = [
-        {"person": p, "first_frame": 0, "last_frame": HALF - 1, "frames_seen": HALF, "views": 3.0}
-        for p in range(PERSONS)
-    ]
-    rows = camera[first : first + HALF]
-    lens = {"focal": rows.focal, "principal_point": rows.principal_point}
-    lens |= {"distortion": rows.distortion, "translation": rows.cam_from_world.translation}
-    moving = {name: (("frame", f"{name}_"), np.array(values)) for name, values in lens.items()}
-    moving["rotation"] = (("frame", "a", "b"), np.array(rows.cam_from_world.rotation))
-    moving["image_size"] = (("side",), np.array([1920, 1080]))
-    attrs = {"clip_id": clip, "pitch": None}
-    still = {key: (dims, values[:1]) for key, (dims, values) in moving.items() if len(dims) > 1}
-    rig = xr.Dataset(
-        {key: (("camera", *dims[1:]), values) for key, (dims, values) in still.items()}
-        | {"image_size": (("camera", "side"), np.array([[1920, 1080]]))},
-        coords={"camera": ["north"]},
-    )
-    return {
-        f"tracking/{clip}": xr.Dataset(coords=coordinates, attrs={"tracks": tracks}),
-        f"triangulation/{clip}": xr.Dataset(placed, coords=coordinates, attrs={"changes": []}),
-        "bundle_adjustment/cameras": rig,
-        f"body_fitting/{clip}": xr.Dataset(
-            fits | placed, coords=coordinates, attrs={"body_model": model.name}
-        ),
-        f"broadcast_calibration/{clip}": xr.Dataset(moving, coords={"frame": frames}, attrs=attrs),
-    }
 
 
 @pytest.fixture(scope="module")
@@ -97,6 +54,11 @@ def origins(model, poses, main_camera, tmp_path_factory):
         for name in "AB":
             (folder / "broadcast" / f"{name}.mp4").write_text(f"{match} {name}")
         parts = [results(model, poses, main_camera, *each) for each in (("A", 0), ("B", HALF))]
+
+        if split == "test":
+            about = {"camera": "north", "kind": "view", "first_frame": 0, "frame_count": HALF}
+            change = {**about, "frame": 4, "shift_px": [30.0, 0.0], "std": 0.1}
+            parts[0]["triangulation/A"].attrs["changes"] = [change]
 
         def digest_of(path, folder=folder):
             return hashlib.sha256((folder / path).read_bytes()).hexdigest()
@@ -161,27 +123,6 @@ def replace_match(registration, match):
     return SimpleNamespace(**vars(registration) | {"spec": spec})
 
 
-def test_a_subject_has_a_shape_of_each_body_model_and_never_a_mean_of_two(tmp_path):
-    def fit(model, clip, first):
-        shape = Shape(np.array([first, *np.zeros(9)]), COVARIANCE)
-        return SubjectFit("keeper", model, clip, shape, 0.5)
-
-    fits = [
-        fit("neutral", "a", 0.4),
-        fit("female", "b", 4.0),
-        fit("neutral", "c", 0.6),
-        SubjectFit("other", "small", "a", Shape(np.ones(4), 0.2 * np.eye(4)), 0.5),
-    ]
-    write_subjects(tmp_path / "subjects.npz", fits)
-    rows = {row[:3]: row.shape for row in read_subjects(tmp_path / "subjects.npz")}
-    # Of two clips 2 x 4.5 of information and 0.5 of the prior: 5 (0.4 + 0.6) / 9.5.
-    assert rows["keeper", "neutral", ""].betas[0] == pytest.approx(5.0 / 9.5)
-    np.testing.assert_allclose(rows["keeper", "neutral", ""].covariance, np.eye(10) / 9.5)
-    assert rows["keeper", "female", ""].betas[0] == pytest.approx(4.0)
-    assert rows["other", "small", ""].betas.shape == (4,)
-    assert len(rows) == 3 + len(fits)
-
-
 def test_a_sound_data_set_passes_and_hides_the_truth(model, written):
     report = check_data_set(written / "set", written / "truth")
     assert (report.findings, len(report.clips)) == ((), 6)
@@ -218,7 +159,33 @@ def test_a_sound_data_set_passes_and_hides_the_truth(model, written):
     page = (written / "set" / "datasheet.html").read_text()
     assert "keeper" in page and "For tests alone." in page and "data:image" in page
     assert "ann-1, run 0001: usable" in page and "Static cameras" in page
-    assert page.count("cleo-1_A") == 0
+    # Nor does what is public tell how a camera of the test part changes.
+    assert page.count("cleo-1_A") == 0 and manifest.clips["cleo-1_A"].rig is None
+    changed = read_rigs(written / "truth")["cleo-1_A"]["north"]
+    assert changed.visible is None and changed.changes[0].frame == 4
+
+
+def test_an_older_data_set_without_rigs_and_shapes_is_checked(written, tmp_path):
+    folder, truth = (shutil.copytree(written / each, tmp_path / each) for each in ("set", "truth"))
+    for old in (folder, truth):
+        for path in (*old.rglob("subjects.npz"), *old.rglob("rigs.json"), *old.rglob("north.npz")):
+            path.unlink()
+    state(lambda stated: [each.pop("rig") for each in stated["clips"].values()])(folder, truth)
+    seal(folder, truth)
+    assert check_data_set(folder, truth).findings == ()
+
+
+def test_a_lens_that_no_coefficients_follow_leaves_out_its_camera(origins, monkeypatch, tmp_path):
+    def refuse(cameras, where):
+        raise InputError(f"{where}: north", expected="a lens", found="a fisheye", todo="Wait.")
+
+    monkeypatch.setattr("flows.results.run_cameras.with_brown_lenses", refuse)
+    store, [first, *_] = origins
+    clip = write_data_set(store, [first], tmp_path / "set", "own", LICENCES).clips[CLIP]
+    assert "a fisheye" in clip.rig["north"].lens["reason"] and clip.rig["north"].visible is None
+    assert check_data_set(tmp_path / "set").findings == ()
+    assert not (tmp_path / "set" / NORTH).exists()
+    assert "left out" in (tmp_path / "set" / "datasheet.html").read_text()
 
 
 def test_boxes_show_whom_the_camera_sees(written):
@@ -386,6 +353,12 @@ FAULTS = {
         "camera_differs",
         "train/cameras/ann-1_A/north.npz",
     ),
+    "rig of the test part": (clip("cleo-1_A", rig={}), "test_truth", "cleo-1_A"),
+    "static camera of the hidden part unstated": (
+        lambda f, t: [(t / "rigs.json").write_text("{}"), seal(f, t)],
+        "views_differ",
+        "cleo-1_A",
+    ),
     "static camera unstated": (clip(CLIP, rig={}), "views_differ", CLIP),
     "static camera of the test part": (
         lambda f, t: shutil.copytree(t / "cameras" / "cleo-1_A", f / "test/cameras/cleo-1_A"),
@@ -396,6 +369,17 @@ FAULTS = {
         files("train/subjects.npz", put("betas", (0, 3), 0.7)),
         "shape_differs",
         "train/subjects.npz",
+    ),
+    "missing row of a clip": (
+        files("train/subjects.npz", lambda a: a.update({k: v[:-1] for k, v in a.items()})),
+        "subjects_differ",
+        "train/subjects.npz",
+    ),
+    # The pooled shape, row 0, is that of this clip alone.
+    "scaled rows of a subject": (
+        files("train/subjects.npz", lambda a: a["betas"].__imul__(1.1)),
+        "shape_differs",
+        "ann-1/A/1",
     ),
     "pooled over body models": (
         files("train/subjects.npz", put("body_models", -1, "smpl-male")),
