@@ -328,7 +328,7 @@ def decode_candidates(maps: Tensor, count: int) -> tuple[Tensor, Tensor]:
     else:
         chance = torch.softmax(flat.flatten(1), dim=1).view_as(flat)
         # As in the kernel, of equal cells in a block of 4 x 4 the first is the peak.
-        high, at = (each.flatten(1) for each in functional.max_pool2d_with_indices(chance, 4))
+        high, at = (each.flatten(1) for each in functional.max_pool2d_with_indices(chance, (4, 4)))
         near = functional.max_pool2d(chance, 7, stride=1, padding=3).flatten(1).gather(1, at)
         peak = (high == near) & (high >= high.amax(dim=1, keepdim=True).clamp(max=least))
         cell, width = at[peak], maps.shape[-1]
