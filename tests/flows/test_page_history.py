@@ -84,7 +84,7 @@ def test_a_run_is_cancelled(ada, monkeypatch):
         assert time.monotonic() - begun < 40
         time.sleep(0.2)
     assert ada.get(MATCH).json()["at_work"]["code"] == 130  # as the command itself ends
-    killed = [sys.executable, "-c", "import os; os.kill(os.getpid(), 2)"]
+    killed = [sys.executable, "-c", "import os, time; os.kill(os.getpid(), 2); time.sleep(9)"]
     monkeypatch.setattr(app_context, "_COMMAND", killed)
     ada.post(f"{MATCH}/runs", json={}).raise_for_status()
     while ada.get(MATCH).json()["at_work"]["state"] == "running":

@@ -391,7 +391,7 @@ def test_names_give_a_shape_only_to_people_who_can_be_the_same(monkeypatch):
     fitted = {"body_fitting/a": bodies(0.0, 1.0, 2.0), "body_fitting/b": bodies(1.1, -4.0)}
     names = {"a": {"1": "kane", "2": "rice", "99": "saka"}, "b": {"0": "kane", "1": "rice"}}
     inputs = SimpleNamespace(unit="a", sources={"people": names}, open=fitted.__getitem__)
-    before = SimpleNamespace(settings=lambda kind: SimpleNamespace(shape_weight=1.0))
+    before = SimpleNamespace(settings=lambda kind: SimpleNamespace(prior_weight=1.0))
     result = SimpleNamespace(warnings=[])
     known = refitting._known_shapes(inputs, before, fitted["body_fitting/a"], result)
     assert list(known) == [1]
