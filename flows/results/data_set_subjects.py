@@ -1,4 +1,4 @@
-"""Who is the same person in a data set, and the shape of each by the clips' static cameras."""
+"""The subjects of a data set, and the shape of each by the static cameras of its clips."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def _composition(manifest: DataSetManifest) -> Section:
 
 
 def _static_cameras(manifest: DataSetManifest) -> Table:
-    """Return the static cameras of each match: sizes, lenses but Brown's, and views that change."""
+    """Return static cameras by match: sizes, lenses other than Brown's, views that change."""
     rigs: dict[str, dict[str, RigCamera]] = {}
     changed: dict[str, list[str]] = {}
     for name, clip in manifest.clips.items():
@@ -102,7 +102,7 @@ def _static_cameras(manifest: DataSetManifest) -> Table:
         )
         said = (", ".join(each) or "-" for each in (sizes, lenses, changed[match]))
         rows.append((match, f"{len(rig)}", *said))
-    titles = ("match", ">cameras", "images [px]", "lenses but Brown's", "views that change")
+    titles = ("match", ">cameras", "images [px]", "lenses other than Brown's", "views that change")
     return Table("Static cameras, cameras/<clip>/<camera>.npz", titles, tuple(rows))
 
 

@@ -45,7 +45,7 @@ def test_all_pairs_of_clips_have_one_level_together():
     few = pool_subjects([fit("a", 0.0), fit("b", away)])
     many = pool_subjects([fit("b", away), *(fit(f"{n}", 0.0) for n in range(19))])
     assert few["keeper", "neutral"][1] is None and many["keeper", "neutral"][1] is not None
-    # A placeholder of a covariance tells nothing.
+    # An identity as covariance stands for none: it tells nothing of the shape.
     paper = pool_subjects([fit("a", 0.0, 0.0), fit("b", away, 0.0)])
     assert paper["keeper", "neutral"][1].betas[0] == pytest.approx(0.5 * away)
 
