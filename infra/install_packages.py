@@ -40,7 +40,9 @@ def pip_settings() -> dict[str, str]:
 def uv_command(settings: dict[str, str]) -> list[str]:
     """Return uv's command that installs as pip would, without what to install."""
     command = [str(Path(sys.executable).with_name("uv")), "pip", "install"]
-    command += ["--python", sys.executable, "--index-strategy", "unsafe-best-match"]
+    command += ["--python", sys.executable]
+    if "extra-index-url" in settings:  # pip takes a version from any index that its user trusts
+        command += ["--index-strategy", "unsafe-best-match"]
     for key, option in OPTIONS.items():
         for value in settings.get(key, "").split():
             command += [option, value]
