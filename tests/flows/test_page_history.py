@@ -74,7 +74,8 @@ def test_what_is_withdrawn_later_changes_no_cause_of_a_run():
 
 def test_a_run_is_cancelled(ada, monkeypatch):
     assert ada.post(f"{MATCH}/cancellation", json={}).status_code == 409
-    sleep = [sys.executable, "-c", "import time; time.sleep(90)"]
+    begin = "import os, signal, time; signal.signal(2, signal.SIG_DFL); "  # as from a terminal
+    sleep = [sys.executable, "-c", begin + "time.sleep(90)"]
     monkeypatch.setattr(app_context, "_COMMAND", sleep)
     ada.post(f"{MATCH}/runs", json={}).raise_for_status()
     begun = time.monotonic()
@@ -84,7 +85,7 @@ def test_a_run_is_cancelled(ada, monkeypatch):
         assert time.monotonic() - begun < 40
         time.sleep(0.2)
     assert ada.get(MATCH).json()["at_work"]["code"] == 130  # as the command itself ends
-    killed = [sys.executable, "-c", "import os, time; os.kill(os.getpid(), 2); time.sleep(9)"]
+    killed = [sys.executable, "-c", begin + "os.kill(os.getpid(), 2); time.sleep(9)"]
     monkeypatch.setattr(app_context, "_COMMAND", killed)
     ada.post(f"{MATCH}/runs", json={}).raise_for_status()
     while ada.get(MATCH).json()["at_work"]["state"] == "running":
