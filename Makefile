@@ -89,8 +89,10 @@ format: develop
 
 # Processes begin with neighbouring tests, which share what they made, and take over the rest of others.
 # Types are checked at the same time: a minute of one core, while some tests only wait.
+# Thousands of small files are written in memory, where it has room: a disk takes seconds to remove a project.
+IN_MEMORY := $(shell df -Pk /dev/shm 2>/dev/null | awk 'NR == 2 && $$4 > 6000000 { print "TMPDIR=/dev/shm" }')
 PYTEST = $(BIN)/mypy & types=$$!; trap "kill $$types" INT TERM; \
-  $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist worksteal $(1); tests=$$?; wait $$types && exit $$tests
+  $(IN_MEMORY) $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist worksteal $(1); tests=$$?; wait $$types && exit $$tests
 
 test: style
 	@$(call PYTEST,-m "not slow")

@@ -40,6 +40,7 @@ def test_a_broadcast_clip_is_calibrated_scored_and_shown(server, tmp_path):
     assert "known least" in page.read_text() and "Mean joint error" in page.read_text()
 
 
+@pytest.mark.slow
 def test_a_broadcast_camera_alone_gives_places_and_with_estimates_bodies(server, tmp_path):
     match, project = tmp_path / "match", ("--project", tmp_path / "project")
     scenario = ("--scenario", "broadcast-pan", "--seed", 2, "--duration", 0.5, "--cameras", 1)

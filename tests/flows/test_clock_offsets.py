@@ -283,6 +283,7 @@ def lab(tmp_path_factory):
     return folder, truth
 
 
+@pytest.mark.slow
 def test_cameras_are_found_and_written_in_place_of_lenses(server, lab, tmp_path):
     folder, truth = lab
     options = ("--project", tmp_path / "p", "--stature", "1.83")

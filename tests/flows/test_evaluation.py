@@ -56,7 +56,7 @@ def test_cameras_without_a_match_have_the_image_that_their_centre_states(tiny, t
         for file in (tiny / "reference" / "cameras").iterdir():
             changed(file, tmp_path / name / "cameras" / file.name, K=halved)
     file = next((tmp_path / "true" / "cameras").iterdir())
-    assert read_camera(file).image_size == pytest.approx([960, 540], abs=10)
+    assert read_camera(file).image_size == pytest.approx([960, 540], abs=30)
     figures = evaluate(tmp_path / "mine", tmp_path / "true")
     assert figures["notes"] == [
         "no match states the pitch: ground errors are those of one of 105 x 68 m"

@@ -31,6 +31,7 @@ def report_images(page):
         yield cv2.imdecode(np.frombuffer(base64.b64decode(content), np.uint8), cv2.IMREAD_COLOR)
 
 
+@pytest.mark.slow
 def test_a_match_of_videos_alone_is_reported_over_images_of_its_videos(server, tmp_path):
     match, project = tmp_path / "match", tmp_path / "project"
     scenario = ("--scenario", "tiny", "--seed", 2, "--duration", 0.2, "--cameras", 3)

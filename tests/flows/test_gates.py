@@ -175,6 +175,7 @@ def test_what_no_run_waits_for_any_more_is_not_listed(store):
         approve(store)
 
 
+@pytest.mark.slow
 def test_always_asks_behind_every_gate_in_turn(store):
     asked = []
     units_of = {stage.name: stage.units(open_match(store, TINY)) for stage in METHOD}

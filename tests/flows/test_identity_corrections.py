@@ -200,6 +200,7 @@ def test_every_door_refuses_what_does_not_fit_the_results(store):
     assert read_journal(store, TINY).entries == ()
 
 
+@pytest.mark.slow
 def test_what_a_run_refused_is_told_so_and_what_no_run_has_yet(store, tmp_path):
     edits = {
         "out": DeletedDetection(camera="cam01", frame=5, detection=77),

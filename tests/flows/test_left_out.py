@@ -41,6 +41,7 @@ def spoil(folder, camera):
     file.write_text(json.dumps(clicked))
 
 
+@pytest.mark.slow
 def test_a_match_with_a_camera_that_cannot_be_calibrated_is_complete_and_warns(tiny, tmp_path):
     folder = shutil.copytree(tiny, tmp_path / "match")
     spoil(folder, "cam01")

@@ -93,6 +93,7 @@ def test_cameras_of_a_mixed_rig_are_right_and_their_people_in_their_regions(
     assert (squared < 7.81).mean() > 0.9  # of 95 %: noise of detectors lasts longer than this one
 
 
+@pytest.mark.slow
 def test_two_cameras_on_a_mast(server, tiny, tmp_path):
     joints = read_joints(tiny / "reference" / "joints.npz").joints
     joints = joints - [*joints[..., :2].mean(axis=(0, 1, 2)), 0.0]
@@ -255,6 +256,7 @@ def exported(server, tiny, tmp_path_factory):
     return cameras, joints, out
 
 
+@pytest.mark.slow
 def test_joints_of_fisheye_cameras_are_within_the_noise_of_the_truth(exported):
     cameras, joints, out = exported
     found = read_joints(out / "joints.npz")

@@ -56,6 +56,7 @@ def tables(database):
         return set(opened.execute("select type, name, sql from sqlite_master"))
 
 
+@pytest.mark.slow
 def test_a_server_answers_its_run_alone_and_later_ones_begin_with_its_database(kept, monkeypatch):
     for name in ("PREFECT_API_URL", CLIENT_LOGIN, SERVER_LOGIN):  # of a server of other tests
         monkeypatch.delenv(name, raising=False)

@@ -89,6 +89,7 @@ def folder(tiny, tmp_path):
     return shutil.copytree(tiny, tmp_path / "match")
 
 
+@pytest.mark.slow
 def test_a_proposal_is_drawn_accepted_and_kept(folder, tiny, tmp_path):
     true = read_camera(tiny / "reference" / "cameras" / "cam01.npz", SIZE)
     write_image(folder, "cam01", render_pitch(true, PITCH, None, 1), side="far")

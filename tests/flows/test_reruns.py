@@ -140,6 +140,7 @@ def test_a_run_finds_an_installed_body_and_keeps_it(tiny, project_copy, tmp_path
     assert refused.code == 1 and "Install that body model again" in refused.err
 
 
+@pytest.mark.slow
 def test_the_first_triangulation_of_a_long_match_skips_frames(tiny, project_copy):
     few = ("--set", "triangulation.max_frames=10", "--until", "bundle_adjustment")
     run_json(tiny, "--project", project_copy, *few)

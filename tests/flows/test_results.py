@@ -216,6 +216,7 @@ def test_report_is_one_page_that_asks_for_nothing(tiny, tiny_run, tmp_path):
         assert (file.read_text(), out.read_text()) == ("other", page)
 
 
+@pytest.mark.slow
 def test_a_reference_that_is_not_scored_is_said(tiny, project_copy, tmp_path, monkeypatch):
     page, own = tmp_path / "report.html", shutil.copytree(tiny, tmp_path / "match") / "reference"
     (own / "joints.npz").write_bytes(b"PK")

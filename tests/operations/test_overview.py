@@ -13,9 +13,11 @@ from page_client import MATCH, log_in, served
 from data_contracts.review import NamedTrack
 from flows import overview
 from flows.layers import write_layer
-from flows.overview import PAGE, Overview, make_summary, read_summary
+from flows.overview import Overview, make_summary, read_summary
 from flows.registering import open_match
 from flows.review.corrections import keep_edits
+from flows.service import status_page
+from flows.web import queue
 from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.registration import register_match
 from worldpose.store.paths import ResultId, summary_path
@@ -163,22 +165,24 @@ def test_a_changed_match_that_was_not_read_yet_is_shown_as_such(project_copy, st
     assert not any(each.is_unseen for each in all_read.look())
 
 
-def test_lists_have_pages_of_fifty_and_the_server_searches(project_copy):
-    copy_match(project_copy, TINY, PAGE)
+def test_lists_have_pages_and_the_server_searches(project_copy, monkeypatch):
+    for module in (queue, status_page):
+        monkeypatch.setattr(module, "PAGE", 5)
+    copy_match(project_copy, TINY, 5)
     ada = log_in(served(project_copy), "Ada")
     while ada.get("/api/matches").json()["left"]:
         pass
     first, second, beyond = (
         ada.get("/api/matches", params={"page": page}).json() for page in (1, 2, 9)
     )
-    assert (len(first["matches"]), len(second["matches"]), beyond["page"]) == (PAGE, 1, 2)
-    assert (first["total"], first["pages"], first["counts"]) == (PAGE + 1, 2, {"ready": PAGE + 1})
-    found = ada.get("/api/matches", params={"search": " COPY017"}).json()
-    assert [each["match"] for each in found["matches"]] == [f"{TINY}-copy017"]
+    assert (len(first["matches"]), len(second["matches"]), beyond["page"]) == (5, 1, 2)
+    assert (first["total"], first["pages"], first["counts"]) == (6, 2, {"ready": 6})
+    found = ada.get("/api/matches", params={"search": " COPY003"}).json()
+    assert [each["match"] for each in found["matches"]] == [f"{TINY}-copy003"]
     assert ada.get("/api/matches", params={"kind": "failed"}).json()["matches"] == []
     assert ada.get(MATCH).json()["state"]["name"] == "ready"
-    assert ada.get("/status").text.count("/#/match/") == PAGE
+    assert ada.get("/status").text.count("/#/match/") == 5
     assert ada.get("/status", params={"page": 2}).text.count("/#/match/") == 1
-    for page, count in ((2, 1), (9, 1), (0, PAGE), (-3, PAGE)):
+    for page, count in ((2, 1), (9, 1), (0, 5), (-3, 5)):
         assert len(ada.get("/api/status", params={"page": page}).json()["matches"]) == count
     assert "page 2 of 2" in ada.get("/status", params={"page": 9}).text

@@ -366,6 +366,7 @@ def test_a_resume_waits_for_a_run_that_is_about_to_be_suspended(monkeypatch, tmp
     assert suspension.resume_suspended(str(tmp_path), "m") == []
 
 
+@pytest.mark.slow
 def test_thousands_of_ended_runs_are_read_once_and_found_soon(queue, tmp_path):
     for number in range(3000):
         run = a_run(id=f"{number}", state="failed", match_id=f"m{number % 500}")

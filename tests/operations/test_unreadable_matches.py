@@ -112,6 +112,7 @@ def silent(monkeypatch, two):
     answer()
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(120)
 def test_requests_that_wait_for_a_silent_disk_leave_the_pages_to_others(silent, two):
     browser = log_in(served(two / "project"), "Ada")

@@ -194,7 +194,7 @@ def fit(joints, known=None, solver=SOLVER):
     return fit_shapes(solver, sampled, known or {}, 50.0)
 
 
-@pytest.mark.parametrize("frames", [100, 1500])
+@pytest.mark.parametrize("frames", [100, pytest.param(1500, marks=pytest.mark.slow)])
 def test_neither_people_nor_offsets_grow_with_the_length_of_a_clip(frames):
     truths, joints = people(3, frames, 0.02)
     shapes = fit(joints)

@@ -311,6 +311,7 @@ def test_people_whose_ankles_are_hidden_stay_at_their_places(seen):
     assert np.linalg.norm(hips - clip.place[:, 1], axis=-1).max() < 0.3
 
 
+@pytest.mark.slow
 def test_people_whose_ankles_are_hidden_are_no_surer_than_their_places():
     """Places 1 m off in all of 30 frames; squares of errors are 1 of their stated variance."""
     squares = []

@@ -87,6 +87,7 @@ FAR = {number: frame(x) for number, x in ((10, -38.0), (40, 38.0))}
 PLACES = np.random.default_rng(3).uniform([-50.0, -30.0], [50.0, 20.0], (24, 2))
 
 
+@pytest.mark.slow
 def test_people_of_known_places_tell_the_side_of_a_camera_that_has_none():
     people, pictures = people_of(FAR, PLACES), pictures_of(FAR)
     pictures.insert(1, (25, GRASS))

@@ -180,6 +180,7 @@ def test_people_who_determine_no_cameras_are_refused(walkers, cameras, count, sh
         locate_cameras(lenses(cameras)[:count], given, FPS, KnownLength(1.8))
 
 
+@pytest.mark.slow
 def test_groups_that_show_different_people_are_named(walkers, cameras):
     first, second = (seen(cameras, walkers[:, p : p + 1] * flip) for p, flip in ((0, 1), (1, -1)))
     keypoints = np.concatenate([first.keypoints, second.keypoints[::-1]], axis=1)

@@ -206,6 +206,7 @@ def test_energies_have_the_values_of_their_equations(body, cameras):
     )
 
 
+@pytest.mark.slow
 def test_refinement_finds_a_moving_person(body, cameras):
     true = moving_person(body)
     joints, tensors = body.keypoints(*true), TensorCameras.of(cameras)

@@ -225,6 +225,7 @@ def farthest(found, true, names):
     return min(off)
 
 
+@pytest.mark.slow
 def test_a_midfield_still_is_calibrated_on_the_stated_side():
     true = circle_camera((0.0, 1.0), 2300.0)
     still = render_pitch(true, PITCH, None, 5)

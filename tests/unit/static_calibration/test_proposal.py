@@ -67,6 +67,7 @@ def test_a_rendered_still_gives_its_camera_without_a_click(proposal):
     assert found.report.decisions[0].startswith("markings proposed from the image")
 
 
+@pytest.mark.slow
 def test_a_purple_cast_hides_no_pitch():
     cast = np.clip(still() * np.array([1.4, 0.5, 1.4]), 0, 255).astype(np.uint8)
     found = calibrate_without_clicks(PITCH, cast, side="near")

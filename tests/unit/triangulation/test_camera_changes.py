@@ -256,6 +256,7 @@ def test_clocks_that_step_are_traced_from_a_wrong_constant(cameras):
     np.testing.assert_allclose(values, [0.0, 0.0, 5.0], atol=0.15)
 
 
+@pytest.mark.slow
 def test_a_drift_with_a_step_and_a_step_of_another_camera_are_traced_together(cameras):
     frames, rate = 600, 1.008
     pixels, confidence, _ = detections(cameras, runner(frames + 10, 3), 1.0)
