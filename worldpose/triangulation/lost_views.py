@@ -1,11 +1,14 @@
 """Cameras whose people meet nobody from some frame on: knocked far, or many frames late.
 
 A detection meets a person where the middles of their torsos are nearer than a reach r in the image.
-If a change is too large for the tracker to follow, this share of a camera's detections falls at
-once. The change is the shift of the view, or of the clock, with which most of them meet again:
+If a change is too large for the tracker to follow, this share of the detections and people that
+could meet falls at once. The change is the shift of the view, or of the clock, with which most meet
+again, detections i and people p that are tracked at t:
 
-    max_d sum_t #{i: min_p |x_i(t) - d - pi(X_p(t))| < r},
-    max_k sum_t #{i: min_p |x_i(t) - pi(X_p(t + k))| < r}.
+    max_d sum_t min(#{i: min_p e_ip(t) < r}, #{p: min_i e_ip(t) < r}),
+    e_ip(t) = |x_i(t) - d - pi(X_p(t))|, or |x_i(t) - pi(X_p(t + k))| for max_k.
+
+So neither bystanders nor hidden people count, nor people who stood there while they were tracked.
 """
 
 from __future__ import annotations
@@ -153,10 +156,8 @@ class _Meetings:
         place = _fall(met, count, margin)
         if place is None:
             return None
-        image, _, inside = self._project(rows)
-        with np.errstate(invalid="ignore"):
-            inside &= ((image >= 0.0) & (image < self.camera.image_size)).all(axis=-1)
-        shown = inside.any(axis=1)
+        shown = self._project(rows)[2].any(axis=1)
+        count = self._count_detections(rows)
         parts = [shown & side for side in (rows < rows[place], rows >= rows[place])]
         if min(part.sum() for part in parts) < margin:
             return None
@@ -176,35 +177,44 @@ class _Meetings:
         return np.arange(0, len(self.seen), every), max(5, second // every)
 
     def _count(self, rows: Integers) -> Integers:
+        """Return how many detections (n,) could each meet a person in view."""
+        people = self._project(rows)[2].sum(axis=1)
+        return np.asarray(np.minimum(self._count_detections(rows), people))
+
+    def _count_detections(self, rows: Integers) -> Integers:
         """Return the number (n,) of detections."""
         return np.asarray(np.isfinite(self.seen[rows, :, 0]).sum(axis=1))
 
     def _met(
         self, rows: Integers, wide: float = 1.0, late: int = 0, shift: Floats | float = 0.0
     ) -> Integers:
-        """Return the number (n,) of detections that meet a person within reaches, with a change."""
+        """Return how many (n,) detections and people meet within reaches, with a change."""
         met = np.zeros(len(rows), dtype=np.int64)
         block = 256  # moments in memory
         for start in range(0, len(rows), block):
             some = rows[start : start + block]
-            image, reach, inside = self._project(some + late)
+            image, reach, inside = self._project(some, late)
             off = np.linalg.norm((self.seen[some] - shift)[:, :, None] - image[:, None], axis=-1)
             near = inside[:, None] & (off < wide * reach[:, None])
-            met[start : start + block] = near.any(axis=2).sum(axis=1)
+            pairs = near.any(axis=2).sum(axis=1), near.any(axis=1).sum(axis=1)
+            met[start : start + block] = np.minimum(*pairs)
         return met
 
-    def _project(self, rows: Integers) -> tuple[Floats, Floats, Flags]:
-        """Return where people are seen (n, persons, 2), their reach [px], and who there is."""
+    def _project(self, rows: Integers, late: int = 0) -> tuple[Floats, Floats, Flags]:
+        """Return images of people (n, persons, 2), their reach [px], and who is in view."""
         reach_m = 0.3
-        there = (rows >= 0) & (rows < len(self.people))
-        people = self.people[np.clip(rows, 0, len(self.people) - 1)]
+        then = rows + late
+        there = (then >= 0) & (then < len(self.people))
+        people = self.people[np.clip(then, 0, len(self.people) - 1)]
         depth = self.camera.cam_from_world.apply(people.reshape(-1, 3))[:, 2].reshape(
             people.shape[:2]
         )
         with np.errstate(invalid="ignore", divide="ignore"):
             image = self.camera.project(people.reshape(-1, 3)).reshape(*people.shape[:2], 2)
             reach = reach_m * self.camera.focal.mean() / depth
-            inside = there[:, None] & (depth > 0.0) & np.isfinite(image).all(axis=-1)
+            # Whoever is not tracked now may stand where he stood then.
+            inside = there[:, None] & (depth > 0.0) & np.isfinite(self.people[rows, :, 0])
+            inside &= ((image >= 0.0) & (image < self.camera.image_size)).all(axis=-1)
         return image, reach, inside
 
     def _reach(self, rows: Integers) -> float:

@@ -213,6 +213,18 @@ def test_a_camera_whose_people_meet_nobody_is_lost(cameras, spoil, row, amount):
         np.testing.assert_allclose(found[0].amount, amount, atol=4.0)
 
 
+@pytest.mark.parametrize("newcomers", [0, 1])
+def test_people_whom_the_others_place_no_more_accuse_no_clock(cameras, newcomers):
+    """Two stand; the others lose one in frame 150. A newcomer is hidden from the camera."""
+    people = np.repeat(runner(1, 2 + newcomers), FRAMES, axis=0)
+    pixels, confidence, index = detections(cameras, people, 1.0)
+    joints, confidence[:, BAD, 2:] = people.copy(), 0.0
+    joints[150:, 1], joints[:150, 2:] = np.nan, np.nan
+    seen = KeypointDetections.from_keypoints(pixels, confidence, index, np.arange(FRAMES))
+    # Before, the one who is lost stood where the camera sees him: no clock is that late.
+    assert BAD not in [each.camera for each in find_lost_views(cameras, seen, joints, FPS)]
+
+
 def hide(pixels, frame, _):
     """Something hides the person from frame 120 on."""
     return np.where(frame[..., None] < 120, pixels, np.nan)
