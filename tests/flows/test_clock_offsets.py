@@ -62,6 +62,7 @@ def test_an_offset_is_found_drawn_and_written(server, shifted, tmp_path):
     assert "match.yaml needs no change" in succeed("synchronize", shifted, *options[:2]).out
 
 
+@pytest.mark.slow
 def test_the_page_shows_the_same_proposal_and_applies_it_in_the_next_version(
     server, tiny, tmp_path, monkeypatch
 ):

@@ -6,6 +6,7 @@ import zipfile
 
 import numpy as np
 import page_client
+import pytest
 from command_line import TINY, worldpose
 from page_client import MATCH
 from typer.testing import CliRunner
@@ -120,6 +121,7 @@ def add_run(project, state, stages):
     store.finish_run(first.model_copy(update=changed))
 
 
+@pytest.mark.slow
 def test_results_stay_reachable_when_a_later_run_has_none(ada, project_copy, tmp_path):
     says = {
         "failed": (("ingest",), "0002 failed and has no people"),

@@ -230,6 +230,7 @@ def test_a_match_is_opened_without_the_lock_of_all_runs(two, monkeypatch):
     assert (runs.go_on("first")["how"], free) == ("resumed m, True", [True])
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(120)
 def test_a_dead_disk_of_many_matches_leaves_reads_to_other_disks(
     two, small_match, short, monkeypatch

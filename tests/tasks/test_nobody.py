@@ -52,6 +52,7 @@ def empty(tiny, tmp_path):
     return store, register(store, folder)[0]
 
 
+@pytest.mark.slow
 def test_a_match_of_nobody_goes_through_two_iterations(empty):
     store, match = empty
     done = set()

@@ -227,6 +227,7 @@ def test_a_camera_of_another_rate_is_that_of_the_image_nearest_to_each_frame(cal
     assert result.attrs["feed_offset"]["frames"] == pytest.approx(0.0, abs=0.3)
 
 
+@pytest.mark.slow
 def test_images_are_those_of_the_clock_and_only_key_frames_of_the_clip_count(tmp_path):
     """A recorder dropped image 6; the key frame is behind the clip, and camera data suffice."""
     true, (width, height) = clip.moving(VIDEO, pan=(-2.0, 6.0)), clip.SIZE

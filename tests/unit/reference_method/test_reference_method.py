@@ -120,7 +120,7 @@ def test_stage_3_moves_projected_markings_onto_drawn_ones():
 
     pitch, true = PitchTemplate.standard(), look_at_camera((0.0, -70.0, 25.0), (-30, 0, 0), 1800.0)
     picture = render_pitch(true, pitch, None, 0)
-    lines = pitch.sample_lines(0.1).points_world
+    lines = pitch.sample_lines(0.3).points_world
     start = look_at_camera((0.0, -70.0, 25.0), (-30.2, 0.05, 0), 1810.0)
 
     def error(camera):

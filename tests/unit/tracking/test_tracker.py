@@ -256,6 +256,7 @@ def test_a_box_tells_the_place_without_ankles_unless_it_ends_with_the_image(ring
     assert np.isnan(locate_feet(camera, bare, PITCH).xy).all()
 
 
+@pytest.mark.slow
 def test_calibration_errors_move_places_by_the_stated_covariance(ring):
     camera = ring(1)
     stated = np.zeros((1, 12, 12))
