@@ -139,7 +139,11 @@ def look_up(away: Tensor, pixels: Tensor) -> Tensor:
     """
     last = pixels.new_tensor(away.shape[::-1]) - 1.0
     column, row = pixels.detach().round().clamp(torch.zeros_like(last), last).long().T
-    slope = torch.stack([each[row, column] for each in torch.gradient(away)[::-1]], dim=-1)
+    left, top = (column - 1).clamp(min=0), (row - 1).clamp(min=0)
+    right, bottom = (column + 1).clamp(max=int(last[0])), (row + 1).clamp(max=int(last[1]))
+    across = (away[row, right] - away[row, left]) / (right - left)
+    down = (away[bottom, column] - away[top, column]) / (bottom - top)
+    slope = torch.stack([across, down], dim=-1)
     return away[row, column] + (slope * (pixels - pixels.detach())).sum(-1)
 
 
