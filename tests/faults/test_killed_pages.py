@@ -136,10 +136,12 @@ class Editor:
         self.places |= moved
 
     def insist(self, method, path, body=None):
-        """The answer of a server that is there, in time."""
+        """The answer of a server that is there or comes back, in time."""
         deadline = time.monotonic() + PATIENCE
         while (answer := self.ask(method, path, body)) is None:
             assert time.monotonic() < deadline, "the server does not come back"
+            if self.server.process.exitcode is not None:  # it died of what a request keeps
+                self.server.revive()
             time.sleep(0.02)
         assert answer[0] == 200, answer
         return answer
