@@ -10,6 +10,7 @@ import numpy as np
 from data_contracts.conventions import COCO17, JOINT_GROUPS
 from flows.results.best_results import bodies_unit, clip_positions, clip_title, person_kinds
 from flows.results.run_cameras import ADJUSTED
+from flows.review.metric_words import point_words
 from worldpose.formats.tables import people_table
 from worldpose.reports.html_page import Table
 from worldpose.reports.run_report import format_number, format_scaled
@@ -89,7 +90,7 @@ def _clicks(result: xr.Dataset, names: list[str]) -> Table | None:
     rows = [
         (
             names[int(result["click_camera"].values[k])],
-            str(result["click"].values[k]),
+            point_words(str(result["click"].values[k])),
             _number(float(np.linalg.norm(result["click_residual"].values[k]))),
             _number(float(result["click_surprise"].values[k])),
             str(result.attrs["click_problem"][k]),
