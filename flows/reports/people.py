@@ -147,7 +147,7 @@ def body_tables(run: Run, clips: tuple[str, ...]) -> list[Table]:
             for person in run[unit]["person"].values.tolist()
         )
         titles = (f">{_BODIES[name][0]}" for name in columns)
-        tables.append(Table(clip_title(clip), (">person", *titles), rows))
+        tables += [Table(clip_title(clip), (">person", *titles), rows)] if rows else []
         tables += _held_out_tables(clip, run.record.figures.get(f"body_fitting/{clip}", {}))
         without = run[unit].attrs.get("without_body") or {}
         if without:
