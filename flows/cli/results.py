@@ -60,9 +60,11 @@ def export(
     from flows.results.best_results import Origin, describe_age, open_results
     from flows.results.export import export as export_formats
     from flows.results.export import release as write_release
+    from flows.results.export import require_formats
     from flows.review.identities import lost_names
     from worldpose.dataset.manifest import LENS_ERRORS
 
+    require_formats(forms, stage)
     changed = "--filled" if filled else "--definition detector"
     if release is not None and (licence is None or filled or definition == "detector"):
         raise UsageError(
@@ -167,6 +169,7 @@ def report(
     from flows.results.best_results import describe_age, open_results
     from flows.results.outputs import record_owner, require_own
 
+    warning = ""
     try:
         known = find_match(store, match, unfinished=True)
     except InputError as error:
@@ -176,7 +179,10 @@ def report(
             raise error from None
         there = known.folder.videos or known.folder.clicked
         what = "is of the registered folder" if there else "has no images"
-        line(f"warning: the report {what}: {error}", to=errors)
+        warning = f"warning: the report {what}: {error}"
+    opened = open_results(store, known.match_id, run).record
+    if warning:
+        line(warning, to=errors)
     clips = [clip.id for clip in known.folder.spec.clips] if videos else []
     films = [f for c in clips for f in out.parent.glob(f"{escape(out.stem)}-{c}*.mp4")]
     places = {out.parent: [out, *films]}
@@ -185,7 +191,6 @@ def report(
     for place, files in places.items():
         names = {file.name: None for file in files}
         require_own(place, names, (known.match_id,), overwrite=overwrite)
-    opened = open_results(store, known.match_id, run).record
     if run == LATEST and (later := describe_age(store, opened)):
         line(later, to=errors)
     films, unscored = write_report(
