@@ -231,8 +231,9 @@ def _exceeding(rule: _Rule, place: str, figures: Figures, limit: float) -> Itera
         for name, value in figures.items()
         if name.partition(".")[0] == rule.metric
     }
+    nobody = 0.0 in (figures.get("joints"), figures.get("bodies"))
     unknown = [part for part, value in own.items() if not isfinite(value)]
-    if unknown or (rule.is_required and figures and not own and figures.get("joints") != 0):
+    if unknown or (rule.is_required and figures and not own and not nobody):
         parts = f" ({', '.join(unknown)})" if any(unknown) else ""
         yield (
             f"{metric_words(rule.metric)[0]} could not be computed in {place}{parts}. Look at it "

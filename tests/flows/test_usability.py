@@ -167,7 +167,7 @@ def test_results_that_are_not_there_are_not_usable(outcome, said):
 
 
 def test_people_who_are_not_in_3d_are_places_that_can_be_used():
-    figures = {"triangulation/clip": {"joints": 0.0}}
+    figures = {"triangulation/clip": {"joints": 0.0}, "body_fitting/clip": {"bodies": 0.0}}
     found = judge_run(RunOutcome(figures=figures, lacks_joints=True), UsableLimits())
     assert found.verdict == "usable with reservations"
     assert found.reservations[0].startswith("no person is in 3D: people have places on the pitch")

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from rigs import rig
 
-from worldpose.bundle_adjustment.report import keypoint_outliers, review_clicks
+from tasks.bundle_adjustment import _figures
+from worldpose.body_fitting.report import FitMetrics
+from worldpose.bundle_adjustment.report import keypoint_outliers, refuse_all, review_clicks
 from worldpose.bundle_adjustment.residuals import KeypointNoise
 from worldpose.bundle_adjustment.solver import solve
 from worldpose.bundle_adjustment.uncertainty import relative_covariance, similarity_steps
@@ -281,3 +283,11 @@ def test_a_click_on_a_point_that_the_camera_cannot_image_is_first_and_says_why(c
     assert problem in review.problem[0]
     assert not any(review.problem[1:])
     assert np.isfinite(review.residual[1:]).all()
+
+
+def test_what_was_not_measured_is_no_metric(clip):
+    made, *_ = clip()
+    none = np.zeros(0, dtype=np.int64)
+    figures = _figures(refuse_all(made, "nobody", none, none, none), list("abcde"))
+    assert figures == {"cameras_changed": 0.0, "cameras_refused": 5.0}
+    assert FitMetrics(25.0).report().offset_rms_m is None
