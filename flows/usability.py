@@ -242,11 +242,8 @@ def _exceeding(rule: _Rule, place: str, figures: Figures, limit: float) -> Itera
     beyond = sorted(own.keys() - set(unknown), key=lambda part: (-own[part], part))
     beyond = [part for part in beyond if exceeds(own[part], limit)]
     if beyond:
-        clicks = [
-            point_words(name.partition(".")[2])
-            for name in figures
-            if rule.metric == "clicks_wrong" and name.startswith("wrong_click.")
-        ]
+        named = (name.partition(".") for name in figures if rule.metric == "clicks_wrong")
+        clicks = [point_words(click) for metric, _, click in named if metric == "wrong_click"]
         yield rule.says.format(
             unit=place,
             value=quantity(rule.metric, own[beyond[0]])

@@ -133,13 +133,10 @@ def _figures(adjusted: BundleAdjustment, camera_ids: list[str]) -> dict[str, flo
         "cameras_refused": float((~adjusted.accepted).sum()),
     }
     if adjusted.verdict.judges.any():
-        figures |= {
-            "noise_scale": adjusted.noise.scale,
-            "noise_correlation": adjusted.noise.correlation,
-            "held_out_gain": adjusted.evidence.gain,
-            "held_out_significance": adjusted.evidence.significance,
-            "people_shift_m": adjusted.evidence.shift,
-        }
+        figures |= {f"noise_{name}": value for name, value in vars(adjusted.noise).items()}
+        figures["held_out_gain"] = adjusted.evidence.gain
+        figures["held_out_significance"] = adjusted.evidence.significance
+        figures["people_shift_m"] = adjusted.evidence.shift
     variance = np.diagonal(adjusted.clip.covariance, axis1=1, axis2=2)[:, :6]
     stated = np.sqrt(variance.reshape(-1, 2, 3).sum(axis=2))[:, ::-1]  # of center and axes
     for c in np.flatnonzero(adjusted.accepted):

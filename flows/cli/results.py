@@ -169,7 +169,6 @@ def report(
     from flows.results.best_results import describe_age, open_results
     from flows.results.outputs import record_owner, require_own
 
-    warning = ""
     try:
         known = find_match(store, match, unfinished=True)
     except InputError as error:
@@ -179,10 +178,8 @@ def report(
             raise error from None
         there = known.folder.videos or known.folder.clicked
         what = "is of the registered folder" if there else "has no images"
-        warning = f"warning: the report {what}: {error}"
-    opened = open_results(store, known.match_id, run).record
-    if warning:
-        line(warning, to=errors)
+        open_results(store, known.match_id, run)  # without a run, that alone is said
+        line(f"warning: the report {what}: {error}", to=errors)
     clips = [clip.id for clip in known.folder.spec.clips] if videos else []
     films = [f for c in clips for f in out.parent.glob(f"{escape(out.stem)}-{c}*.mp4")]
     places = {out.parent: [out, *films]}
@@ -191,6 +188,7 @@ def report(
     for place, files in places.items():
         names = {file.name: None for file in files}
         require_own(place, names, (known.match_id,), overwrite=overwrite)
+    opened = open_results(store, known.match_id, run).record
     if run == LATEST and (later := describe_age(store, opened)):
         line(later, to=errors)
     films, unscored = write_report(

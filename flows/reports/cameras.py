@@ -44,14 +44,8 @@ _ORIGINS = {
 def camera_table(run: Run, spec: MatchSpec) -> Table:
     """Tabulate origin, expected errors and clicks of each static camera."""
     columns = (
-        "camera",
-        "from",
-        ">expected ground error mm",
-        ">95 % mm",
-        ">clicks rms px",
-        ">clicks",
-        "wrong clicks",
-        "weak because",
+        *("camera", "from", ">expected ground error mm", ">95 % mm", ">clicks rms px", ">clicks"),
+        *("wrong clicks", "weak because"),
     )
     rows = []
     for camera in spec.static_cameras:

@@ -103,13 +103,11 @@ def mark_places(
     joints = np.full((*places.on_plane.shape, 17, 3), np.nan)
     joints[:, np.searchsorted(places.person, tracks.person_ids)] = tracks.joints
     alone = places.on_plane & np.isnan(joints).all(axis=(-2, -1))
-    x, y = np.moveaxis(places.xy[alone], -1, 0)
+    mark = np.full((17, 3), np.nan)
+    mark[COCO17_HIPS[0] :] = [*[[-0.3, 0.0, 1.0], [0.3, 0.0, 1.0]] * 2, *[[0.0, 0.0, 0.0]] * 2]
+    x, y = places.xy[alone].T
     ground = np.zeros_like(x) if pitch is None else PitchTemplate.from_spec(pitch).height(x, y)
-    side, up = (np.array(each) for each in ([-0.3, 0.3, -0.3, 0.3, 0.0, 0.0], [1, 1, 1, 1, 0, 0]))
-    legs = x[:, None] + side, np.broadcast_to(y[:, None], (len(y), 6)), ground[:, None] + up
-    marked = joints[alone]
-    marked[:, COCO17_HIPS[0] :] = np.stack(legs, axis=-1)
-    joints[alone] = marked
+    joints[alone] = np.column_stack([x, y, ground])[:, None] + mark
     return JointTracks(tracks.frames, places.person, joints), bool(alone.any())
 
 

@@ -60,26 +60,14 @@ def adjustment_tables(run: Run) -> list[Table]:
     rows = []
     for c, name in enumerate(names):
         marking, people = result["marking_error"].values[c], result["held_out_error"].values[c]
-        rows.append(
-            (
-                name,
-                *(_number(value) for value in (*marking, *people)),
-                str(int(result["judges"].values[c])),
-                str(result.attrs["reasons"][c]),
-                str(result.attrs["weak"][c]),
-            )
-        )
+        judges = str(int(result["judges"].values[c]))
+        said = (str(result.attrs[each][c]) for each in ("reasons", "weak"))
+        rows.append((name, *map(_number, (*marking, *people)), judges, *said))
     cameras = Table(
         "Clicked markings and held-out people, before and after the adjustment",
         (
-            "camera",
-            ">markings before px",
-            ">after px",
-            ">people before px",
-            ">after px",
-            ">held-out keypoints",
-            "change",
-            "least certain direction",
+            *("camera", ">markings before px", ">after px", ">people before px", ">after px"),
+            *(">held-out keypoints", "change", "least certain direction"),
         ),
         tuple(rows),
     )

@@ -306,8 +306,6 @@ def export(
 
     def write(place: Path) -> list[Path]:
         written = _export(origin, forms, place)
-        if not written:
-            raise _nobody(forms)
         for clip in origin.clips if origin.filled and out.suffix != VIEWER_SUFFIX else ():
             tracks = origin.tracks(clip)
             written.append(place / "origins" / f"{clip}.npz")
@@ -337,15 +335,6 @@ def forms_without_people(run: Run, spec: MatchSpec) -> tuple[str, ...]:
     if broadcast_views(run):
         return OF_CAMERAS
     return OF_CAMERAS[:1] if static_cameras(run, spec) else ()
-
-
-def _nobody(forms: list[str]) -> InputError:
-    return InputError(
-        f"--format {' --format '.join(forms)}",
-        expected="a person with joints",
-        found="none: people have positions on the pitch only, or there are none",
-        todo="Choose a format of positions: positions, minimap or csv.",
-    )
 
 
 def _file_for_folder(out: Path, forms: list[str]) -> UsageError:
@@ -385,9 +374,16 @@ def _export(origin: best_results.Origin, forms: list[str], out: Path) -> list[Pa
     """
     require_formats(forms, origin.stage)
     of_people = [form for form in forms if form not in (*POSITION_FORMATS, *OF_CAMERAS)]
-    if of_people and not any(best_results.has_joints(origin.run, clip) for clip in origin.clips):
-        raise _nobody(of_people)
-    written = [path for form in dict.fromkeys(forms) for path in EXPORTS[form](origin, out)]
+    has = not of_people or any(best_results.has_joints(origin.run, clip) for clip in origin.clips)
+    chosen = dict.fromkeys(forms if has else ())
+    written = [path for form in chosen for path in EXPORTS[form](origin, out)]
+    if not written:
+        raise InputError(
+            f"--format {' --format '.join(of_people or forms)}",
+            expected="a person with joints",
+            found="none: people have positions on the pitch only, or there are none",
+            todo="Choose a format of positions: positions, minimap or csv.",
+        )
     clips, plane = best_results.find_clips(origin.run.record), best_results.PLANE
     on_plane = [clip for clip in clips if f"{plane}/{clip}" in origin.run]
     if kinds := {clip: best_results.person_kinds(origin.run, clip) for clip in on_plane}:

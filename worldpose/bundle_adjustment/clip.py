@@ -61,8 +61,7 @@ class Clicks:
     @classmethod
     def none(cls) -> Clicks:
         """Return the clicks of a camera without any."""
-        none = np.empty(0, dtype=np.bool_)
-        return cls((), np.empty((0, 3)), np.empty((0, 2)), none, np.empty(0), noise_px=1.0)
+        return cls((), np.empty((0, 3)), np.empty((0, 2)), np.empty(0, np.bool_), np.empty(0), 1.0)
 
 
 @dataclass(frozen=True, eq=False)
