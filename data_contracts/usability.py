@@ -33,6 +33,9 @@ class UsableLimits(Record):
     max_filled_share: Share = 0.05
     """Share of joints that no camera sees, filled by the motion model alone [1]: accuracy is that
     of a guess there."""
+    max_ground_error_m: Amount = 0.15
+    """Expected error of a static camera on the pitch, median over what it sees [m], where no joints
+    measure the effect on people: the limit of which calibration itself warns."""
     max_misplacement_m: Amount = 0.05
     """Displacement of people by the uncertainty of a camera's calibration, root mean square per
     axis at the median person [m]: as large as the error of a joint."""
@@ -52,9 +55,8 @@ class UsableLimits(Record):
     line of 0.12 m is 4 px wide at 60 m with a focal length of 2000 px. Beyond 3 px the drawn pitch
     is visibly off."""
     max_plane_std_m: Amount = 1.0
-    """Standard deviation of the places of people on the pitch in a match without static cameras,
-    root of the trace, median over people and frames [m]: twice that of a good camera in simulation,
-    0.47 m."""
+    """Standard deviation of the places of people whom only their feet place, root of the trace,
+    median over people and frames [m]: twice that of a good camera in simulation, 0.47 m."""
     max_unusable_share: Share = 0.5
     """Share of the time without people, or of detections without a track, beyond which results are
     not usable [1]: most of the clip has none."""

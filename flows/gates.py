@@ -112,7 +112,8 @@ def _of_bodies(figures: Figures) -> Figures:
     share = figures["filled"] / figures["bodies"] if figures["bodies"] else 0.0
     # With two cameras none can be held out, and nothing is compared.
     by_group = [value for name, value in figures.items() if name.startswith(f"{EXCESS}.")]
-    return {**figures, "filled_share": share, EXCESS: max(by_group, default=0.0)}
+    own = {"filled_share": share, EXCESS: max(by_group, default=0.0)}
+    return {**({} if figures["bodies"] else {"offset_rms_m": 0.0}), **figures, **own}
 
 
 GATES: Final[Mapping[str, Gate]] = {

@@ -16,7 +16,7 @@ from data_contracts.run import BODY_STAGES, UnitFailure
 from data_contracts.usability import Usability, UsableLimits
 from flows.gates import exceeds
 from flows.layers import merge_general
-from flows.review.metric_words import metric_words, quantity
+from flows.review.metric_words import metric_words, point_words, quantity
 from flows.stage import Match
 
 Figures = Mapping[str, float]
@@ -66,6 +66,10 @@ class _Rule:
 
 
 _STATED: Final = """\
+static_calibration expected_ground_error_median_m max_ground_error_m
+the calibration of {unit} places people on the pitch only to {value}, and no joints confirm it.
+Click more markings, where there are none.
+
 static_calibration clicks_wrong
 clicks of {unit} contradict the others and are not used: {value}. Correct or remove them.
 
@@ -119,8 +123,9 @@ broadcast_tracking unmatched_share max_unmatched_share
 no track follows {value} of the people found by the broadcast camera in {unit}. Look for people
 beside the pitch, or for wrong key frames.
 
-broadcast_tracking plane_std_m max_plane_std_m
-places of people in {unit} are uncertain by {value}. Click more key frames.
+tracking,broadcast_tracking plane_std_m max_plane_std_m
+places of people in {unit} are uncertain by {value}, where only their feet place them. Click more
+markings, or more key frames of a broadcast camera.
 
 ingest,detection,tracking corrections_refused
 {value} corrections of {unit} do not fit its results and are not applied. Correct them on the page
@@ -182,7 +187,11 @@ def exceeded_limits(figures: Mapping[str, Figures], limits: UsableLimits) -> lis
     """Return a sentence for each metric beyond its limit; metrics are given by unit and name."""
     found: list[str] = []
     figures = {name: _as_normal(own, figures) for name, own in figures.items()}
+    # Joints measure what errors of the cameras do to people.
+    has_joints = any(own.get("joints") for own in figures.values())
     for rule in _RULES:
+        if has_joints and rule.limit == "max_ground_error_m":
+            continue
         last = _REPLACED.get(rule.stage, rule.stage)
         for name, own in figures.items():
             stage, _, unit = name.partition("/")
@@ -222,8 +231,9 @@ def _exceeding(rule: _Rule, place: str, figures: Figures, limit: float) -> Itera
         for name, value in figures.items()
         if name.partition(".")[0] == rule.metric
     }
+    nobody = 0.0 in (figures.get("joints"), figures.get("bodies"))
     unknown = [part for part, value in own.items() if not isfinite(value)]
-    if unknown or (rule.is_required and figures and not own and figures.get("joints") != 0):
+    if unknown or (rule.is_required and figures and not own and not nobody):
         parts = f" ({', '.join(unknown)})" if any(unknown) else ""
         yield (
             f"{metric_words(rule.metric)[0]} could not be computed in {place}{parts}. Look at it "
@@ -232,10 +242,13 @@ def _exceeding(rule: _Rule, place: str, figures: Figures, limit: float) -> Itera
     beyond = sorted(own.keys() - set(unknown), key=lambda part: (-own[part], part))
     beyond = [part for part in beyond if exceeds(own[part], limit)]
     if beyond:
+        named = (name.partition(".") for name in figures if rule.metric == "clicks_wrong")
+        clicks = [point_words(click) for metric, _, click in named if metric == "wrong_click"]
         yield rule.says.format(
             unit=place,
             value=quantity(rule.metric, own[beyond[0]])
-            + (f" (limit {quantity(rule.metric, limit)})" if rule.limit else ""),
+            + (f" (limit {quantity(rule.metric, limit)})" if rule.limit else "")
+            + (f" ({', '.join(clicks)})" if clicks else ""),
             part=", ".join(beyond),
             when=_when(rule.metric.rpartition("_")[0], beyond[0], figures),
         )

@@ -19,6 +19,7 @@ from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.errors import UsageError
 from worldpose.pitch.template import PitchTemplate
 from worldpose.review.identities import select_triangulated
+from worldpose.static_calibration.settings import StaticCalibrationSettings
 from worldpose.store.writer import ResultWriter
 
 
@@ -40,7 +41,7 @@ def bundle_adjustment(inputs: UnitInputs, result: ResultWriter) -> None:
     clip = Clip(
         cameras=opened.cameras,
         covariance=np.where(np.isfinite(covariance), covariance, 0.0),  # 0 = a given camera
-        clicks=tuple(_clicks(camera, pitch) for camera in known),
+        clicks=tuple(_clicks(inputs, camera, pitch) for camera in opened.camera_ids),
         fps=float(inputs.sources["fps"]) / stride,
         detections=opened.detections[:].assign_people(index),
         joints=joints,
@@ -111,13 +112,18 @@ def _read_people(
     return person, index, joints, views
 
 
-def _clicks(known: xr.Dataset, pitch: PitchTemplate | None) -> Clicks:
+def _clicks(inputs: UnitInputs, camera: str, pitch: PitchTemplate | None) -> Clicks:
     """Return the clicked points of a camera; none for a given one."""
+    unit = f"static_calibration/{camera}"
+    known = inputs.open(unit)
     if pitch is None or "point_pixel" not in known:
         return Clicks.none()
     names = tuple(str(name) for name in known["point"].values)
     places, pixels = pitch.positions(names), known["point_pixel"].values
-    return Clicks(names, places, pixels, known["point_inlier"].values)
+    surprise = known["point_surprise"].fillna(np.inf).values
+    noise = inputs.made_from(unit).settings(StaticCalibrationSettings).click_noise_px
+    noise *= known.attrs["noise_scale"]
+    return Clicks(names, places, pixels, known["point_inlier"].values, surprise, noise)
 
 
 def _figures(adjusted: BundleAdjustment, camera_ids: list[str]) -> dict[str, float]:
@@ -125,12 +131,12 @@ def _figures(adjusted: BundleAdjustment, camera_ids: list[str]) -> dict[str, flo
     figures = {
         "cameras_changed": float(adjusted.accepted.sum()),
         "cameras_refused": float((~adjusted.accepted).sum()),
-        "noise_scale": adjusted.noise.scale,
-        "noise_correlation": adjusted.noise.correlation,
-        "held_out_gain": adjusted.evidence.gain,
-        "held_out_significance": adjusted.evidence.significance,
-        "people_shift_m": adjusted.evidence.shift,
     }
+    if adjusted.verdict.judges.any():
+        figures |= {f"noise_{name}": value for name, value in vars(adjusted.noise).items()}
+        figures["held_out_gain"] = adjusted.evidence.gain
+        figures["held_out_significance"] = adjusted.evidence.significance
+        figures["people_shift_m"] = adjusted.evidence.shift
     variance = np.diagonal(adjusted.clip.covariance, axis1=1, axis2=2)[:, :6]
     stated = np.sqrt(variance.reshape(-1, 2, 3).sum(axis=2))[:, ::-1]  # of center and axes
     for c in np.flatnonzero(adjusted.accepted):

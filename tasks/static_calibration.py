@@ -222,6 +222,7 @@ def _figures(report: CalibrationReport) -> dict[str, float]:
         "reprojection_rms_px": float(np.sqrt(np.mean(np.square(used)) * 2.0)) if used else np.nan,
         "clicks_used": float(len(used)),
         "clicks_wrong": float(len(report.wrong)),
+        **{f"wrong_click.{name}": 1.0 for name in report.wrong},
         "weak": float(report.weak),
         "click_noise_px": report.click_noise,
         "click_freedom": report.click_freedom,

@@ -60,9 +60,11 @@ def export(
     from flows.results.best_results import Origin, describe_age, open_results
     from flows.results.export import export as export_formats
     from flows.results.export import release as write_release
+    from flows.results.export import require_formats
     from flows.review.identities import lost_names
     from worldpose.dataset.manifest import LENS_ERRORS
 
+    require_formats(forms, stage)
     changed = "--filled" if filled else "--definition detector"
     if release is not None and (licence is None or filled or definition == "detector"):
         raise UsageError(
@@ -176,6 +178,7 @@ def report(
             raise error from None
         there = known.folder.videos or known.folder.clicked
         what = "is of the registered folder" if there else "has no images"
+        open_results(store, known.match_id, run)  # without a run, that alone is said
         line(f"warning: the report {what}: {error}", to=errors)
     clips = [clip.id for clip in known.folder.spec.clips] if videos else []
     films = [f for c in clips for f in out.parent.glob(f"{escape(out.stem)}-{c}*.mp4")]

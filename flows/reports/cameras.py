@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Any, cast
 
@@ -13,6 +12,7 @@ from data_contracts.triangulation import HEALTH_MEASURES, CameraChange
 from flows.layers import pitch_of_run
 from flows.reports.match_pictures import background_image, shown_pitch
 from flows.results.best_results import clip_title
+from flows.review.metric_words import point_words
 from flows.stage import Match
 from worldpose.camera_consistency.health import judge_health
 from worldpose.geometry.cameras import Camera, camera_from_arrays
@@ -44,14 +44,8 @@ _ORIGINS = {
 def camera_table(run: Run, spec: MatchSpec) -> Table:
     """Tabulate origin, expected errors and clicks of each static camera."""
     columns = (
-        "camera",
-        "from",
-        ">expected ground error mm",
-        ">95 % mm",
-        ">clicks rms px",
-        ">clicks",
-        "wrong clicks",
-        "weak because",
+        *("camera", "from", ">expected ground error mm", ">95 % mm", ">clicks rms px", ">clicks"),
+        *("wrong clicks", "weak because"),
     )
     rows = []
     for camera in spec.static_cameras:
@@ -64,7 +58,7 @@ def camera_table(run: Run, spec: MatchSpec) -> Table:
                 origin = origin.replace("clicks", "proposed markings")
             if "point_inlier" in result:
                 is_wrong = ~result["point_inlier"].values
-                wrong = [str(name) for name in result["point"].values[is_wrong]]
+                wrong = [point_words(str(name)) for name in result["point"].values[is_wrong]]
         rows.append(
             (
                 camera.id,
@@ -185,12 +179,6 @@ def paint_pictures(
     ]
 
 
-def _spoken(point: str) -> str:
-    """Return a point's name as pages write it; `at_52.50_19.16` is (52.5, 19.2) m."""
-    place = re.match(r"at_(-?[\d.]+)_(-?\d+\.\d+)", point)
-    return f"({float(place[1]):.1f}, {float(place[2]):.1f}) m" if place else point.replace("_", " ")
-
-
 def camera_evidence(store: Store, run: Run, match: Match, name: str, camera: Camera) -> bytes:
     """Return a PNG of one calibrated camera: clicks on its still, and the expected ground error."""
     pitch = shown_pitch(run, match)
@@ -206,7 +194,7 @@ def camera_evidence(store: Store, run: Run, match: Match, name: str, camera: Cam
         camera,
         f"camera {name}",
         pitch,
-        clicks=[Click(_spoken(point), at, inlier[point]) for point, at in clicked.items()],
+        clicks=[Click(point_words(point), at, inlier[point]) for point, at in clicked.items()],
         still=background_image(store, match, name),
         error_map=ErrorMap(
             result["ground_x"].values, result["ground_y"].values, result["ground_error"].values

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from data_contracts.arrays import Image, Integers
+from data_contracts.conventions import COCO17_HIPS
+from data_contracts.pitch import PitchSpec
 from flows.reports.broadcast import (
     MAX_VIDEO_S,
     broadcast_video_frames,
@@ -16,12 +18,19 @@ from flows.reports.broadcast import (
     write_broadcast_video,
 )
 from flows.reports.match_pictures import frame_pictures, shown_pitch
-from flows.results.best_results import Origin, body_tracks, joint_tracks, placed_joints
+from flows.results.best_results import (
+    Origin,
+    body_tracks,
+    clip_positions,
+    joint_tracks,
+    placed_joints,
+)
 from flows.results.run_cameras import broadcast_views, static_cameras
 from flows.results.tool_exports import ImageView, image_views
 from flows.stage import Match
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.reports.bodies import BodyTracks
 from worldpose.reports.videos import overlay_frames
 from worldpose.store.store import Run, Store
@@ -65,7 +74,8 @@ def write_clip_video(
     if owner in broadcast_views(run):
         write_broadcast_video(run, match, owner, file)
         return
-    tracks = joint_tracks(run, clip)
+    pitch = shown_pitch(run, match)
+    tracks, _ = mark_places(run, clip, joint_tracks(run, clip), pitch)
     frames = video_frames(run, match, clip, owner)
     views = image_views(Origin(run, match.registration), clip, tracks.frames, corrected=True)
     view = next(view for view in views if view.name == owner)
@@ -78,9 +88,27 @@ def write_clip_video(
             dark = np.zeros((height, width, 3), dtype=np.uint8)  # where the camera has no frame
             yield dark if picture is None else picture
 
-    pitch = shown_pitch(run, match)
     drawn = overlay_frames(pictures(), cameras, tracks, frames, pitch, bodies)
     write_video(file, drawn, match.folder.spec.fps / video_step(match), quality=23)
+
+
+def mark_places(
+    run: Run, clip: str, tracks: JointTracks, pitch: PitchSpec | None
+) -> tuple[JointTracks, bool]:
+    """Return a clip's best joints, with a mark where only the feet place a person, and if any is.
+
+    The mark is a triangle on its tip: ankles at the place, knees and hips 1 m above it.
+    """
+    places = clip_positions(run, clip)
+    joints = np.full((*places.on_plane.shape, 17, 3), np.nan)
+    joints[:, np.searchsorted(places.person, tracks.person_ids)] = tracks.joints
+    alone = places.on_plane & np.isnan(joints).all(axis=(-2, -1))
+    mark = np.full((17, 3), np.nan)
+    mark[COCO17_HIPS[0] :] = [*[[-0.3, 0.0, 1.0], [0.3, 0.0, 1.0]] * 2, *[[0.0, 0.0, 0.0]] * 2]
+    x, y = places.xy[alone].T
+    ground = np.zeros_like(x) if pitch is None else PitchTemplate.from_spec(pitch).height(x, y)
+    joints[alone] = np.column_stack([x, y, ground])[:, None] + mark
+    return JointTracks(tracks.frames, places.person, joints), bool(alone.any())
 
 
 def people_at_images(

@@ -9,7 +9,7 @@ import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.pitch import PitchSpec
-from flows.reports.clip_video import people_at_images
+from flows.reports.clip_video import mark_places, people_at_images
 from flows.reports.match_pictures import background_image, frame_picture, shown_pitch
 from flows.results.best_results import (
     Origin,
@@ -60,17 +60,20 @@ def clip_pictures(
         truth = JointTracks(truth.frames[own], truth.person_ids, truth.joints[own])
     pictures = []
     if len(tracks.frames):
+        tracks, has_marks = mark_places(run, clip, tracks, pitch)
         first = int(tracks.frames[0])
         view = _static_views(run, match, clip, tracks)[int(seen[0].argmax())]
         widest, camera = view.name, view.camera_in(first)
         shown, bodies = people_at_images(run, clip, tracks, view)
         image = _image_with_people(store, match, widest, first)
         here = f"{clip_title(clip)}, frame {first}"
-        beneath = "" if image is None else ", over its image"
+        beneath = "." if image is None else ", over its image."
+        if has_marks:
+            beneath += " A triangle stands on its tip where only the feet place a person."
         pictures = [
             CaptionedImage(
                 f"{here}, from camera {widest}: markings and reconstructed people, "
-                f"projected by the estimated camera{beneath}.",
+                f"projected by the estimated camera{beneath}",
                 plot_camera_view(camera, f"camera {widest}", shown, 0, still=image, pitch=pitch),
             ),
             CaptionedImage(
@@ -78,7 +81,7 @@ def clip_pictures(
                 plot_stadium(cameras, "", tracks, pitch=pitch),
             ),
         ]
-        if bodies is not None:
+        if bodies is not None and np.isfinite(bodies.poses.transl[0]).any():
             pictures.append(_bodies(store, bodies, match, clip, (widest, camera), pitch))
     above = plot_paths(tracks, truth=truth, cameras=cameras, pitch=pitch)
     pictures.append(CaptionedImage(f"{clip_title(clip)}: the paths of all people.", above))

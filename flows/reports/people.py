@@ -10,6 +10,7 @@ import numpy as np
 from data_contracts.conventions import COCO17, JOINT_GROUPS
 from flows.results.best_results import bodies_unit, clip_positions, clip_title, person_kinds
 from flows.results.run_cameras import ADJUSTED
+from flows.review.metric_words import point_words
 from worldpose.formats.tables import people_table
 from worldpose.reports.html_page import Table
 from worldpose.reports.run_report import format_number, format_scaled
@@ -59,26 +60,14 @@ def adjustment_tables(run: Run) -> list[Table]:
     rows = []
     for c, name in enumerate(names):
         marking, people = result["marking_error"].values[c], result["held_out_error"].values[c]
-        rows.append(
-            (
-                name,
-                *(_number(value) for value in (*marking, *people)),
-                str(int(result["judges"].values[c])),
-                str(result.attrs["reasons"][c]),
-                str(result.attrs["weak"][c]),
-            )
-        )
+        judges = str(int(result["judges"].values[c]))
+        said = (str(result.attrs[each][c]) for each in ("reasons", "weak"))
+        rows.append((name, *map(_number, (*marking, *people)), judges, *said))
     cameras = Table(
         "Clicked markings and held-out people, before and after the adjustment",
         (
-            "camera",
-            ">markings before px",
-            ">after px",
-            ">people before px",
-            ">after px",
-            ">held-out keypoints",
-            "change",
-            "least certain direction",
+            *("camera", ">markings before px", ">after px", ">people before px", ">after px"),
+            *(">held-out keypoints", "change", "least certain direction"),
         ),
         tuple(rows),
     )
@@ -89,7 +78,7 @@ def _clicks(result: xr.Dataset, names: list[str]) -> Table | None:
     rows = [
         (
             names[int(result["click_camera"].values[k])],
-            str(result["click"].values[k]),
+            point_words(str(result["click"].values[k])),
             _number(float(np.linalg.norm(result["click_residual"].values[k]))),
             _number(float(result["click_surprise"].values[k])),
             str(result.attrs["click_problem"][k]),
@@ -146,7 +135,7 @@ def body_tables(run: Run, clips: tuple[str, ...]) -> list[Table]:
             for person in run[unit]["person"].values.tolist()
         )
         titles = (f">{_BODIES[name][0]}" for name in columns)
-        tables.append(Table(clip_title(clip), (">person", *titles), rows))
+        tables += [Table(clip_title(clip), (">person", *titles), rows)] if rows else []
         tables += _held_out_tables(clip, run.record.figures.get(f"body_fitting/{clip}", {}))
         without = run[unit].attrs.get("without_body") or {}
         if without:

@@ -172,6 +172,7 @@ def _sections(store: Store, run: Run, match: Match, truth: JointTracks | None) -
     filmed = clips if match.has_static_cameras else ()
     cameras = static_cameras(run, match.folder.spec)
     viewer, left_out = report_viewer(run, match)
+    extent = extent_of(run, match) if clips else None
     broadcast = list[CaptionedImage | Table]()
     if broadcast_views(run):  # late: it imports the estimators of a broadcast camera
         from flows.reports.broadcast import broadcast_pictures, broadcast_tables
@@ -195,7 +196,7 @@ def _sections(store: Store, run: Run, match: Match, truth: JointTracks | None) -
             "too few cameras see the person; a body of such a person comes from the poses of a "
             "monocular method. Mixed: both, in different frames.",
         ),
-        *([counted_section(extent_of(run, match))] if clips else []),
+        *([counted_section(extent)] if extent and extent.poses else []),
         Section(
             "Detections",
             tuple(p for clip in filmed for p in detection_pictures(store, run, match, clip)),

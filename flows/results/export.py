@@ -281,6 +281,8 @@ EXPORTS: dict[str, Callable[[best_results.Origin, Path], Iterable[Path]]] = {
 
 OF_JOINTS = {"joints", "coco", "trc", "c3d", "csv", "parquet", "viewer", "rerun"}
 """Formats that have the joints of a chosen stage."""
+POSITION_FORMATS = ("positions", "minimap", "csv", "parquet", "viewer")
+"""Formats that hold people without joints, whom only their feet place on the pitch."""
 OF_CAMERAS = ("worldpose", "slahmr-cameras")
 """Formats that hold cameras without people; the second one of broadcast cameras alone."""
 CLASHING = {"worldpose", "challenge", "challenge-2025"}
@@ -304,13 +306,6 @@ def export(
 
     def write(place: Path) -> list[Path]:
         written = _export(origin, forms, place)
-        if not written:
-            raise InputError(
-                f"--format {' --format '.join(forms)}",
-                expected="a person with joints",
-                found="none: people have positions on the pitch only, or there are none",
-                todo="Choose a format of positions: positions, minimap or csv.",
-            )
         for clip in origin.clips if origin.filled and out.suffix != VIEWER_SUFFIX else ():
             tracks = origin.tracks(clip)
             written.append(place / "origins" / f"{clip}.npz")
@@ -351,17 +346,14 @@ def _file_for_folder(out: Path, forms: list[str]) -> UsageError:
     )
 
 
-def _export(origin: best_results.Origin, forms: list[str], out: Path) -> list[Path]:
-    """Write formats like `export`, also for a release, whose manifest has the frame rate.
-
-    If a broadcast camera alone films people, kinds.json tells that they are not triangulated.
-    """
+def require_formats(forms: list[str], stage: str | None) -> None:
+    """Refuse formats that do not exist, that a stage does not have, or that clash."""
     for form in forms:
         if form not in EXPORTS:
             raise unknown_name(f"--format {form}", form, EXPORTS)
-    if origin.stage is not None and (others := sorted(set(forms) - OF_JOINTS)):
+    if stage is not None and (others := sorted(set(forms) - OF_JOINTS)):
         raise UsageError(
-            f"--stage {origin.stage}",
+            f"--stage {stage}",
             expected=f"formats of joints: {', '.join(sorted(OF_JOINTS))}",
             found=f"--format {' --format '.join(others)}, of the best results alone",
             todo="Export these formats without --stage.",
@@ -373,7 +365,25 @@ def _export(origin: best_results.Origin, forms: list[str], out: Path) -> list[Pa
             found="formats that all write cameras/<clip>.npz",
             todo="Export them into different folders.",
         )
-    written = [path for form in dict.fromkeys(forms) for path in EXPORTS[form](origin, out)]
+
+
+def _export(origin: best_results.Origin, forms: list[str], out: Path) -> list[Path]:
+    """Write formats like `export`, also for a release, whose manifest has the frame rate.
+
+    If a broadcast camera alone films people, kinds.json tells that they are not triangulated.
+    """
+    require_formats(forms, origin.stage)
+    of_people = [form for form in forms if form not in (*POSITION_FORMATS, *OF_CAMERAS)]
+    has = not of_people or any(best_results.has_joints(origin.run, clip) for clip in origin.clips)
+    chosen = dict.fromkeys(forms if has else ())
+    written = [path for form in chosen for path in EXPORTS[form](origin, out)]
+    if not written:
+        raise InputError(
+            f"--format {' --format '.join(of_people or forms)}",
+            expected="a person with joints",
+            found="none: people have positions on the pitch only, or there are none",
+            todo="Choose a format of positions: positions, minimap or csv.",
+        )
     clips, plane = best_results.find_clips(origin.run.record), best_results.PLANE
     on_plane = [clip for clip in clips if f"{plane}/{clip}" in origin.run]
     if kinds := {clip: best_results.person_kinds(origin.run, clip) for clip in on_plane}:

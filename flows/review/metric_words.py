@@ -50,6 +50,15 @@ _BEYOND: Final = re.compile(
 _UNKNOWN: Final = re.compile(r"(?P<name>\w+) could not be computed")
 
 
+def point_words(point: str) -> str:
+    """Return a point's name as pages write it; `at_52.50_19.16` is (52.5, 19.2) m."""
+    place = re.match(r"at_(-?[\d.]+)_(-?\d+\.\d+)(.*)", point)
+    if place is not None:
+        x, y = (round(float(each), 1) + 0.0 for each in place.groups()[:2])
+        point = f"({x:g}, {y:g}) m{place[3]}"
+    return re.sub(r"\.again\w*$", ", once more", point).replace("_", " ")
+
+
 def metric_words(name: str) -> tuple[str, str]:
     """Return a metric's name in words, and its unit; `offset_rms_m` is `offset rms` in `m`."""
     rest, _, last = name.rpartition("_")

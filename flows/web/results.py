@@ -11,7 +11,6 @@ from tempfile import TemporaryDirectory
 from threading import Lock
 from typing import Annotated, Any, Final
 
-import numpy as np
 from fastapi import APIRouter, HTTPException, Query
 from fastapi.responses import FileResponse, Response
 
@@ -26,12 +25,12 @@ from flows.results.best_results import (
     clips_of,
     describe_later,
     find_clips,
-    joint_tracks,
+    has_joints,
     open_results,
     tracked_people,
 )
 from flows.results.comparison import SubjectChange, compare_runs, paired_people
-from flows.results.export import export, forms_without_people
+from flows.results.export import POSITION_FORMATS, export, forms_without_people
 from flows.results.outputs import OWNERS
 from flows.results.run_cameras import broadcast_views
 from flows.review.identities import names_said
@@ -47,8 +46,6 @@ from worldpose.store.store import Run, Store
 BINARY: Final = "application/octet-stream"
 BROADCAST_FORMATS: Final = ("challenge", "challenge-2025", "tracks", "slahmr-cameras")
 """Formats of a calibrated broadcast camera."""
-POSITION_FORMATS: Final = ("positions", "minimap", "csv", "parquet", "viewer")
-"""Export formats that hold people without joints, whom only their feet place on the pitch."""
 CACHED_FILES: Final = 12
 """Files that are kept; the oldest is removed for a new one."""
 REPORT_POLICY: Final = (
@@ -148,7 +145,7 @@ def _player_names(match: Match, run: Run) -> dict[str, str]:
 
 def why_without_joints(run: Run, clip: str) -> str | None:
     """Return why no person of a clip has joints in 3D; None if some person has."""
-    if np.isfinite(joint_tracks(run, clip).joints).any():
+    if has_joints(run, clip):
         return None
     unit = f"tracking/{clip}"
     said = run.manifest(unit).warnings if unit in run else ()

@@ -17,11 +17,12 @@ from test_release_formats import match_folder, origin, tracked
 from typer.testing import CliRunner
 
 from data_contracts.release import EXPORT_FORMATS, EXPORT_PURPOSES
+from flows import registering
 from flows.cli.app import app
 from flows.results import export as export_module
 from flows.results import outputs
 from flows.results.best_results import Origin
-from flows.results.export import CLASHING, COUNTED, EXPORTS, export
+from flows.results.export import CLASHING, COUNTED, EXPORTS, OF_CAMERAS, POSITION_FORMATS, export
 from flows.results.outputs import OWNERS
 from worldpose.errors import InputError, UsageError, WorldposeError
 from worldpose.geometry.lens_models import LensModel
@@ -102,9 +103,10 @@ def test_strange_results_are_written_or_refused(match_folder, tmp_path, form, ca
         assert not out.exists(), "an error leaves nothing"
     else:
         assert case != "nothing"
+        has_people = case == "one frame"
+        assert has_people or form in (*POSITION_FORMATS, *OF_CAMERAS), "nobody is written as joints"
         assert all(path.is_file() for path in written)
-        # MOTChallenge's file of nobody is empty.
-        assert form == "tracks" or all(path.stat().st_size for path in written)
+        assert all(path.stat().st_size for path in written)
         assert len(set(written)) == len(written)
         assert all(path.is_relative_to(out) for path in written)
         there = {path for path in out.rglob("*") if path.is_file()}
@@ -196,7 +198,8 @@ def test_a_missing_package_is_named(match_folder, tmp_path, monkeypatch, form):
     ("arguments", "code", "message"),
     [
         (("nobody", "--format", "joints"), 1, "match nobody: expected a match folder or one of"),
-        (("MATCH", "--format", "excel"), 2, "--format excel: expected one of joints"),
+        (("MATCH", "--format", "excel"), 2, "^error: --format excel: expected one of joints"),
+        (("nobody", "--format", "excel"), 2, "^error: --format excel: expected one of joints"),
         (("MATCH", "--format", "joints", "--stage", "sleep"), 2, "--stage sleep: expected a resu"),
         (("MATCH", "--format", "challenge", "--format", "worldpose"), 2, "different file names"),
         (("MATCH", "--format", "gltf", "--licence", "EMPTY"), 1, "--licence .*found nothing"),
@@ -215,6 +218,18 @@ def test_the_command_says_one_thing_and_writes_nothing(
     assert re.search(message, answer.err)
     assert answer.err.count("error:") == 1 and "Traceback" not in answer.err
     assert {path.name for path in tmp_path.iterdir()} == {"empty.txt"}
+
+
+def test_a_report_without_a_run_asks_for_one_and_does_not_speak_of_images(tmp_path, monkeypatch):
+    def away(*_, **__):
+        raise InputError("match m", "its folder", "none", "Register it.")
+
+    known = SimpleNamespace(match_id="m", folder=SimpleNamespace(videos={}, clicked={}))
+    monkeypatch.setattr(registering, "find_match", away)
+    monkeypatch.setattr(registering, "open_stored", lambda *_: known)
+    done = CliRunner().invoke(app, ["report", "m", "--project", str(tmp_path / "project")])
+    assert "run" in str(done.exception)
+    assert "has no images" not in done.stderr
 
 
 @pytest.mark.parametrize("form", ["worldpose", "gltf", "positions"])

@@ -72,7 +72,8 @@ def held_out(before, after):
         (ADJUSTMENT, {"cameras_changed": 0.0}, []),  # as cameras on one mast
         (ADJUSTMENT, {"cameras_changed": 1.0}, ["held_out_error_after_m", "held_out_growth"]),
         (ACCEPTANCE, {"bodies": 100.0, "filled": 6.0, "offset_rms_m": 0.01}, ["filled_share"]),
-        (ACCEPTANCE, {"bodies": 0.0, "filled": 0.0, "offset_rms_m": 0.01}, []),
+        (ACCEPTANCE, {"bodies": 0.0, "filled": 0.0}, []),
+        (ACCEPTANCE, {"bodies": 1.0, "filled": 0.0}, ["offset_rms_m could"]),
         (ACCEPTANCE, GOOD_BODIES | {"held_out_certain_excess_m.knee": 0.01}, []),
         (
             ACCEPTANCE,

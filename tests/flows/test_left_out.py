@@ -259,6 +259,9 @@ def test_one_camera_gives_positions_on_the_pitch_with_their_uncertainty(server, 
     tiles = page.read_text()
     assert f"{len(shown)}</b>" in tiles
     assert "people on the pitch, 0 with joints" in tiles
+    assert "people per frame" not in tiles
+    measured = ("clock_error_frames", "noise_factor", "offset_rms_m", "people_shift_m")
+    assert not [name for name in measured if name in tiles]
     assert "<b>0 m</b>" not in tiles
     refused = worldpose("export", match, *project, "--format", "trc", "--out", tmp_path / "trc")
     assert refused.code == 1

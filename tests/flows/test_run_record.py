@@ -98,7 +98,10 @@ def test_all_iterations_ask_as_the_run_that_waits(store, monkeypatch):
 
 
 def test_a_run_is_judged_by_the_limits_of_its_match_and_anew_when_they_change(store):
-    click = "clicks of cam03 contradict the others and are not used: 1. Correct or remove them."
+    click = (
+        "clicks of cam03 contradict the others and are not used: 1 (penalty mark left). "
+        "Correct or remove them."
+    )
     assert store.run(TINY).usability.reservations == (click,)
     succeed("settings", TINY, "--set", "max_ray_distance_m=0.001", "--project", store.url)
     done = worldpose("run", TINY, "--project", store.url, "--json")

@@ -55,8 +55,18 @@ def test_a_healthy_run_is_usable_and_adjusted_cameras_replace_those_before():
         ("body_fitting/clip", {"offset_rms_m": 0.05}, r"bodies in clip lie 5 cm \(limit 3 cm\)"),
         ("body_fitting/clip", WORSE, r"bodies in clip are farther .* \(knee\), by 2"),
         ("broadcast_calibration/clip", {"expected_error_median_px": 4.0}, r"4 px \(limit 3 px\)"),
-        ("static_calibration/cam1", {"clicks_wrong": 5.0}, "clicks of cam1 contradict .*: 5"),
+        ("static_calibration/cam1", {"clicks_wrong": 5.0}, r"clicks of cam1 contradict .*: 5\. C"),
+        (
+            "static_calibration/cam1",
+            {
+                "clicks_wrong": 2.0,
+                "wrong_click.at_-52.50_0.04.again": 1.0,
+                "wrong_click.b_l": 1.0,
+            },
+            r"cam1 contradict .*: 2 \(\(-52\.5, 0\) m, once more, b l\)\. Correct",
+        ),
         ("broadcast_tracking/clip", PLANE, r"places of people .* 9 m \(limit 1 m\)"),
+        ("tracking/clip", PLANE, r"places of people .* 9 m \(limit 1 m\)"),
         # A metric that is not there, or not a number, is no good one.
         ("triangulation/other", {"unhealthy_share": 0.0}, "could not be computed in other"),
         ("retriangulation/clip", NO_NUMBER, r"misplacement could not be computed in clip \(cam1\)"),
@@ -84,6 +94,20 @@ def test_few_clicks_know_their_noise_badly_and_cameras_may_move_farther(freedom,
     assert any("contradict the calibration of cam1" in each for each in found.reservations) == (
         is_said
     )
+
+
+@pytest.mark.parametrize(("joints", "is_said"), [(0.0, True), (2550.0, False)])
+def test_a_camera_that_calibration_calls_uncertain_is_said_where_no_joints_check_it(
+    joints, is_said
+):
+    figures = {"retriangulation/clip": {"joints": joints, "standard_deviation_m": 0.05}}
+    figures["static_calibration/left"] = {"expected_ground_error_median_m": 0.1765}
+    figures["static_calibration/good"] = {"expected_ground_error_median_m": 0.149}
+    found = judge_run(RunOutcome(figures=HEALTHY | figures), UsableLimits()).reservations
+    assert [re.sub(" only.*", "", each) for each in found] == [
+        "the calibration of left places people on the pitch"
+    ] * is_said
+    assert not is_said or "17.6 cm (limit 15 cm)" in found[0]
 
 
 def test_results_that_end_before_bodies_name_their_last_stage():
@@ -143,7 +167,7 @@ def test_results_that_are_not_there_are_not_usable(outcome, said):
 
 
 def test_people_who_are_not_in_3d_are_places_that_can_be_used():
-    figures = {"triangulation/clip": {"joints": 0.0}}
+    figures = {"triangulation/clip": {"joints": 0.0}, "body_fitting/clip": {"bodies": 0.0}}
     found = judge_run(RunOutcome(figures=figures, lacks_joints=True), UsableLimits())
     assert found.verdict == "usable with reservations"
     assert found.reservations[0].startswith("no person is in 3D: people have places on the pitch")

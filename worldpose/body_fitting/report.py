@@ -26,7 +26,7 @@ class BodyFittingReport(Record):
     """Fitted bodies in frames without any joint of the person [1]."""
     guided: int
     """Bodies fitted with a monocular pose [1]."""
-    offset_rms_m: float
+    offset_rms_m: float | None
     """Root mean square offset per axis from a body's joint to the detector's [m]."""
     residual_m: tuple[float | None, ...]
     """Median distance of triangulated joints, minus those offsets, from the body's [m]."""
@@ -110,7 +110,7 @@ class FitMetrics:
             bodies=bodies,
             filled=filled,
             guided=guided,
-            offset_rms_m=float(np.sqrt(np.mean(self._offsets**2))),
+            offset_rms_m=float(np.sqrt(np.mean(self._offsets**2))) if bodies else None,
             residual_m=tuple(_median(self._all("residual", person)) for person in persons),
             reprojection_px=tuple(
                 _median(self._all("reprojection", person)) if seen else None for person in persons

@@ -31,16 +31,22 @@ class Clicks:
         points_world: (n, 3) [m], world.
         points_image: (n, 2) [px].
         inlier: (n,) bool, whether the calibration uses it.
+        surprise: (n,) Mahalanobis distance from the prediction by the calibration's other evidence.
+        noise_px: standard deviation of a click in the calibration, each axis [px].
     """
 
     names: tuple[str, ...]
     points_world: Floats
     points_image: Floats
     inlier: Flags
+    surprise: Floats
+    noise_px: float
 
     @classmethod
-    def of(cls, calibration: StaticCalibration, pitch: PitchTemplate) -> Clicks:
-        """Return all clicked points of a camera, inliers and outliers of its calibration."""
+    def of(
+        cls, calibration: StaticCalibration, pitch: PitchTemplate, stated_px: float = 1.0
+    ) -> Clicks:
+        """Return all clicked points of a camera, which was calibrated with a stated noise [px]."""
         points = calibration.report.points
         names = tuple(point.name for point in points)
         return cls(
@@ -48,12 +54,14 @@ class Clicks:
             points_world=pitch.positions(names),
             points_image=np.array([point.pixel for point in points]).reshape(-1, 2),
             inlier=np.array([point.inlier for point in points], dtype=np.bool_),
+            surprise=np.array([point.mahalanobis for point in points], dtype=np.float64),
+            noise_px=stated_px * calibration.report.noise_scale,
         )
 
     @classmethod
     def none(cls) -> Clicks:
         """Return the clicks of a camera without any."""
-        return cls((), np.empty((0, 3)), np.empty((0, 2)), np.empty(0, dtype=np.bool_))
+        return cls((), np.empty((0, 3)), np.empty((0, 2)), np.empty(0, np.bool_), np.empty(0), 1.0)
 
 
 @dataclass(frozen=True, eq=False)

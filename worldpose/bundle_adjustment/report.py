@@ -40,9 +40,7 @@ def adjustment_arrays(
     outliers = keypoint_outliers(
         clip, adjusted.cameras, adjusted.noise, settings.wrong_keypoint, settings.max_review_items
     )
-    clicks = review_clicks(
-        clip.clicks, adjusted.cameras, adjusted.covariance, settings.click_noise_px
-    )
+    clicks = review_clicks(clip.clicks, adjusted.cameras, adjusted.covariance, adjusted.accepted)
     weak = [
         weak_direction(adjusted.cameras[c], adjusted.covariance[c]) for c in range(len(clip.clicks))
     ]
@@ -130,8 +128,9 @@ class ClickReview:
         camera: (n,)
         name: name of each point of the pitch.
         residual: (n, 2) [px], projected minus clicked; NaN where the camera cannot image the point.
-        surprise: (n,) Mahalanobis distance from the prediction of all other data [1]; infinite
-            where the camera cannot image the point.
+        surprise: (n,) Mahalanobis distance from the prediction of all other data [1], the
+            calibration's own for a camera that did not change; infinite where the camera cannot
+            image the point.
         problem: reason why the camera cannot image each point; empty where it can.
     """
 
@@ -187,11 +186,19 @@ def review_clicks(
     clicks: tuple[Clicks, ...],
     cameras: Camera,
     covariance: Floats,
-    click_noise: float,
+    changed: Flags,
 ) -> ClickReview:
     """Return every clicked point's residual and its Mahalanobis distance.
 
-    A given camera has a covariance of zero; the noise of a click is per axis [px].
+    The residual of a click that pulled its camera has the covariance s^2 - J C J^T, with the noise
+    s that made C. Where little of s^2 remains, the click alone determines the camera, and no error
+    of it can be seen.
+
+    Args:
+        clicks: clicks of every camera.
+        cameras: (cameras,) batch.
+        covariance: (cameras, 12, 12) covariance of a step.
+        changed: (cameras,) bool, whether a camera differs from its calibration.
     """
     camera: list[int] = []
     name: list[str] = []
@@ -206,17 +213,17 @@ def review_clicks(
         off = pixel - clicked.points_image
         by_step = np.where(imaged[:, None, None], by_step, 0.0)
         spread = np.einsum("nij,jk,nlk->nil", by_step, covariance[c], by_step)
-        # A click used in the calibration has pulled the camera towards it.
         sign = np.where(clicked.inlier, -1.0, 1.0)[:, None, None]
-        values, vectors = np.linalg.eigh(click_noise**2 * np.eye(2) + sign * spread)
+        variance = clicked.noise_px**2
+        values, vectors = np.linalg.eigh(variance * np.eye(2) + sign * spread)
         along = np.einsum("nij,ni->nj", vectors, off)
-        # At least a tenth of the noise: rounding may leave zero.
-        values = np.maximum(values, 0.01 * click_noise**2)
+        values = np.where(values < 0.1 * variance, np.inf, values)
+        own = np.sqrt((along**2 / values).sum(axis=1)) if changed[c] else clicked.surprise
         camera += [c] * len(clicked.names)
         name += clicked.names
         problem += problems
         residual.append(off)
-        surprise.append(np.where(imaged, np.sqrt((along**2 / values).sum(axis=1)), np.inf))
+        surprise.append(np.where(imaged, own, np.inf))
     order = np.argsort(-np.concatenate(surprise), kind="stable")
     return ClickReview(
         camera=np.array(camera, dtype=np.int64)[order],

@@ -119,21 +119,12 @@ def counted_section(found: DataSetStatistics) -> Section:
         _number(found.longest_trajectory_m, ".1f"),
     )
     columns = (
-        "camera",
-        ">people per frame",
-        ">frames",
-        ">poses",
-        ">minutes",
-        ">distance km",
-        ">mean speed m/s",
-        ">longest way m",
+        *("camera", ">people per frame", ">frames", ">poses", ">minutes", ">distance km"),
+        *(">mean speed m/s", ">longest way m"),
     )
-    blocks: list[Table | CaptionedImage] = [Table("", columns, (row,))]
-    blocks.append(
-        CaptionedImage(
-            "Histograms of trajectory lengths and of clip lengths.", plot_statistics(found)
-        )
-    )
+    about = "Histograms of trajectory lengths and of clip lengths."
+    picture = CaptionedImage(about, plot_statistics(found))
+    blocks: list[Table | CaptionedImage] = [Table("", columns, (row,)), picture]
     if len(found.clips) > 1:
         rows = tuple(
             (

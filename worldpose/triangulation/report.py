@@ -38,8 +38,9 @@ class TriangulationReport(Record):
     """Median over joints [px]."""
     standard_deviation_m: float | None
     """Median over joints of the root of the covariance's trace [m]."""
-    noise_factor: float
-    """Median over joints of the learned noise of a confident keypoint over the stated one [1]."""
+    noise_factor: float | None
+    """Median over joints of the learned noise of a confident keypoint over the stated one [1]; None
+    without joints."""
     misplacement_m: tuple[float | None, ...]
     """Displacement of people by each camera's calibration, root mean square per axis at the median
     person [m]; None without people or with offsets disabled."""
@@ -137,7 +138,7 @@ class Agreement:
             mean_views=self.views / self.found if self.found else None,
             reprojection_error_px=self.error.median,
             standard_deviation_m=self.deviation.median,
-            noise_factor=noise_factor,
+            noise_factor=noise_factor if self.found else None,
             misplacement_m=tuple(each.median for each in self.misplaced),
         )
 

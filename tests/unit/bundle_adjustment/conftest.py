@@ -89,7 +89,8 @@ def clip():
             points = rng.uniform([-18.0, -18.0, 0.0], [18.0, 18.0, 0.3], (clicked, 3))
             pixels = true[c].project(points) + rng.standard_normal((clicked, 2))
             names = tuple(f"point_{k}" for k in range(clicked))
-            clicks.append(Clicks(names, points, pixels, np.ones(clicked, dtype=bool)))
+            used = np.ones(clicked, dtype=bool)
+            clicks.append(Clicks(names, points, pixels, used, np.zeros(clicked), noise_px=1.0))
         made = Clip(
             cameras=base,
             covariance=np.tile(np.diag(KNOWN**2), (cameras, 1, 1)),

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from rigs import rig
 
-from worldpose.bundle_adjustment.report import keypoint_outliers, review_clicks
+from tasks.bundle_adjustment import _figures
+from worldpose.body_fitting.report import FitMetrics
+from worldpose.bundle_adjustment.report import keypoint_outliers, refuse_all, review_clicks
 from worldpose.bundle_adjustment.residuals import KeypointNoise
 from worldpose.bundle_adjustment.solver import solve
 from worldpose.bundle_adjustment.uncertainty import relative_covariance, similarity_steps
@@ -211,25 +213,43 @@ def test_planted_keypoints_come_first(clip):
 
 
 @pytest.mark.parametrize(
-    ("rests", "surprise"),
-    # 12 px across and 9 px down at 1 px; across the camera has 0.6 px, less or besides that.
-    [(True, np.hypot(12.0 / 0.8, 9.0)), (False, np.hypot(12.0 / np.sqrt(1.36), 9.0))],
+    ("rests", "noise", "variance", "surprise"),
+    # 12 px across and 9 px down; across the camera has a variance of its own.
+    [
+        (True, 1.0, 0.36, np.hypot(12.0 / 0.8, 9.0)),
+        (False, 1.0, 0.36, np.hypot(12.0 / np.sqrt(1.36), 9.0)),
+        # The clicks of a camera are as noisy as its calibration found, and so is its covariance.
+        (True, 2.6, 4.0, np.hypot(12.0 / np.sqrt(2.76), 9.0 / 2.6)),
+        # A click that alone determines the camera across is not tested there.
+        (True, 1.0, 0.999, 9.0),
+        (True, 1.0, 1.5, 9.0),
+    ],
 )
-def test_a_wrong_click_is_more_surprising_than_honest_ones(clip, rests, surprise):
+def test_a_wrong_click_is_more_surprising_than_honest_ones(clip, rests, noise, variance, surprise):
     made, true, _ = clip()
     clicks = made.clicks[2]
     image, inlier = clicks.points_image.copy(), clicks.inlier.copy()
     image[4] = true[2].project(clicks.points_world[4:5])[0] + [12.0, -9.0]
     inlier[4] = rests
-    changed = replace(clicks, points_image=image, inlier=inlier)
+    changed = replace(clicks, points_image=image, inlier=inlier, noise_px=noise)
     all_clicks = (*made.clicks[:2], changed, *made.clicks[3:])
     covariance = np.zeros_like(made.covariance)
-    covariance[2, PARAMETERS.index("cx"), PARAMETERS.index("cx")] = 0.36
-    review = review_clicks(all_clicks, true, covariance, click_noise=1.0)
+    covariance[2, PARAMETERS.index("cx"), PARAMETERS.index("cx")] = variance
+    review = review_clicks(all_clicks, true, covariance, np.ones(5, dtype=bool))
     assert (review.camera[0], review.name[0]) == (2, "point_4")
     np.testing.assert_allclose(review.residual[0], [-12.0, 9.0], atol=1e-9)
     assert review.surprise[0] == pytest.approx(surprise, rel=1e-9)
     assert review.surprise[1] < 4.2
+
+
+def test_clicks_of_a_camera_that_did_not_change_are_judged_by_its_calibration(clip):
+    made, *_ = clip()
+    calibrated = [replace(clicks, surprise=np.arange(12.0)) for clicks in made.clicks]
+    changed = np.array([True, True, False, True, True])
+    review = review_clicks(tuple(calibrated), made.cameras, made.covariance, changed)
+    own = review.camera == 2
+    assert review.surprise[own].tolist() == np.arange(12.0)[::-1].tolist()
+    assert np.array(review.name)[own].tolist() == [f"point_{k}" for k in range(11, -1, -1)]
 
 
 IMPOSSIBLE = {
@@ -253,12 +273,21 @@ def test_a_click_on_a_point_that_the_camera_cannot_image_is_first_and_says_why(c
         points_world=np.concatenate([clicks.points_world, place]),
         points_image=np.concatenate([clicks.points_image, [[960.0, 540.0]]]),
         inlier=np.append(clicks.inlier, False),
+        surprise=np.append(clicks.surprise, np.inf),
     )
     clip_of = replace(made, clicks=(*made.clicks[:2], changed, *made.clicks[3:]))
-    review = review_clicks(clip_of.clicks, true, made.covariance, click_noise=1.0)
+    review = review_clicks(clip_of.clicks, true, made.covariance, np.ones(5, dtype=bool))
     assert (review.camera[0], review.name[0]) == (2, "impossible")
     assert np.isnan(review.residual[0]).all()
     assert review.surprise[0] == np.inf
     assert problem in review.problem[0]
     assert not any(review.problem[1:])
     assert np.isfinite(review.residual[1:]).all()
+
+
+def test_what_was_not_measured_is_no_metric(clip):
+    made, *_ = clip()
+    none = np.zeros(0, dtype=np.int64)
+    figures = _figures(refuse_all(made, "nobody", none, none, none), list("abcde"))
+    assert figures == {"cameras_changed": 0.0, "cameras_refused": 5.0}
+    assert FitMetrics(25.0).report().offset_rms_m is None

@@ -23,7 +23,8 @@ from data_contracts.conventions import COCO17, COCO17_BONES
 from data_contracts.evaluation import CameraErrors, CameraEvaluation, Evaluation
 from data_contracts.pitch import PitchSpec
 from data_contracts.run import UnitFailure
-from flows.reports import clips
+from flows.reports import clip_video, clips
+from flows.reports.people import body_tables
 from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BodyParameters
@@ -343,20 +344,39 @@ def test_bodies_are_seen_through_and_replace_bones():
     assert not drawn([11], people=people, bodies=bodies, focal=CLOSE)[0].any()
 
 
+def places(other):
+    """Person 3 in frame 7, triangulated, and 4 in frames 7 and 8, by the feet alone."""
+    xy = np.array([[[20.0, 10.0], other], [[np.nan, np.nan], other]])
+    on_plane, names = np.array([[False, True], [False, True]]), ["", "ann"]
+    unknown = np.zeros((2, 2, 2, 2)), np.full(2, np.nan), np.ones((2, 2))
+    return Positions(np.array([7, 8]), np.array([3, 4]), names, on_plane, xy, *unknown)
+
+
+def test_people_whom_only_their_feet_place_are_marked_in_images(monkeypatch):
+    monkeypatch.setattr(clip_video, "clip_positions", lambda *_: places([2.0, 1.0]))
+    one = JointTracks(np.array([7, 8]), np.array([3]), np.full((2, 1, 17, 3), np.nan))
+    one.joints[0] = 5.0
+    marked, has_marks = clip_video.mark_places(None, "clip", one, PitchSpec())
+    assert has_marks
+    assert marked.person_ids.tolist() == [3, 4]
+    np.testing.assert_array_equal(marked.joints[:, 0], one.joints[:, 0])
+    feet, hips = (marked.joints[:, 1, list(each)] for each in ((15, 16), (11, 12)))
+    np.testing.assert_allclose(feet, np.broadcast_to([2.0, 1.0, 0.0], (2, 2, 3)), atol=1e-3)
+    np.testing.assert_allclose(hips.mean(axis=1), [[2.0, 1.0, 1.0]] * 2, atol=1e-3)
+    assert drawn([8], people=marked)[0].any()
+    assert not drawn([8], people=one)[0].any()
+
+
+def test_bodies_of_nobody_have_no_table():
+    fits = xr.Dataset(coords={"person": np.zeros(0, int)}, attrs={"without_body": {"3": "feet"}})
+    fitted = SimpleNamespace(record=SimpleNamespace(figures={}))
+    fitted = type("Fitted", (dict,), vars(fitted))({"body_fitting/clip": fits})
+    (table,) = body_tables(fitted, ("clip",))
+    assert table.rows == (("3", "feet"),)
+
+
 def test_people_are_drawn_at_their_places_and_in_the_way_of_their_kind():
-    xy = np.array([[[20.0, 10.0], [-20.0, -10.0]], [[np.nan, np.nan], [-20.0, -10.0]]])
-    on_plane = np.array([[False, True], [False, True]])
-    people = Positions(
-        np.array([7, 8]),
-        np.array([3, 4]),
-        ["", "ann"],
-        on_plane,
-        xy,
-        np.zeros((2, 2, 2, 2)),
-        np.full(2, np.nan),
-        np.ones((2, 2)),
-    )
-    first, second = minimap_frames(people, PitchSpec())
+    first, second = minimap_frames(places([-20.0, -10.0]), PitchSpec())
     assert first.shape == (780, 1150, 3) and first.dtype == np.uint8
 
     def colour(image, x, y):
