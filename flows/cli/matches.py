@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from math import isnan
 from pathlib import Path
@@ -15,7 +16,7 @@ from data_contracts.pitch import TemplateName
 from flows.cli.console import answer, errors, line, print_json, print_table
 from flows.cli.options import DEFAULT_PROJECT, given_options
 from flows.layers import known_pitch
-from flows.registering import register
+from flows.registering import register, runs_of_pitch
 from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.formats.calibration_unit import doubt_middle
@@ -122,7 +123,8 @@ def import_command(
         about = {"file": str(target), "rows": len(data.frame), "notes": list(data.notes)}
         answer(about, f"wrote {target}: {len(data.frame)} rows", *data.notes)
     elif kind == "--pitch" and pitch is not None:
-        import_pitch(pitch, template, out, left_handed=left_handed)
+        runs = runs_of_pitch(Store.open_or_new(project), out)
+        import_pitch(pitch, template, out, runs, left_handed=left_handed)
     elif challenge is not None:
         _import_challenge(challenge, out, fps)
     elif pose2sim is not None:
@@ -244,7 +246,8 @@ def _import_lenses(files: list[Path], out: Path, camera: str | None) -> None:
 
 def _import_clicks(file: Path, out: Path, camera: str | None, store: Store) -> None:
     """Write clicks and own points into a match folder, and print what was read."""
-    found = import_clicks(file, out, camera, known_pitch(store, out, read_spec(out)))
+    pitch = known_pitch(store, out, read_spec(out))
+    found = import_clicks(file, out, camera, pitch, runs_of_pitch(store, out))
     questions = []
     if found.repeated:
         from flows.review.repeated_clicks import explain_repeated  # late: it loads the estimators
@@ -267,11 +270,16 @@ def _import_clicks(file: Path, out: Path, camera: str | None, store: Store) -> N
 
 
 def import_pitch(
-    survey: Path, template: TemplateName | None, out: Path, *, left_handed: bool
+    survey: Path,
+    template: TemplateName | None,
+    out: Path,
+    runs: Sequence[str],
+    *,
+    left_handed: bool,
 ) -> None:
     """Align a survey with the world frame, write pitch.json and print the residuals."""
     from worldpose.formats.files import whole_file
-    from worldpose.ingest.pitch_file import refuse_unread_pitch
+    from worldpose.ingest.pitch_file import require_free_pitch
     from worldpose.pitch.survey import SurveySettings, fit_survey, read_survey
 
     file = out / "pitch.json"
@@ -282,7 +290,7 @@ def import_pitch(
             found="one",
             todo="Move the file away first; another pitch makes another match.",
         )
-    refuse_unread_pitch(out)
+    require_free_pitch(out, runs)
     fit = fit_survey(
         read_survey(survey, template or "football"), SurveySettings(left_handed=left_handed)
     )

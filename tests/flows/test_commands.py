@@ -230,3 +230,50 @@ def test_a_match_whose_folder_has_moved_says_how_it_goes_on_and_does(store, tmp_
         open_for_review(store, "a")
     register(store, tmp_path / "b", unfinished=True)
     assert open_for_review(store, "a").folder.folder == tmp_path / "b"
+
+
+def clicks_of_places(file, camera, shift):
+    """Labelled places [m] in an image of a camera, of which the pitch names none."""
+    places = [(x + shift, y) for x in (-13.3, 3.3) for y in (4.4, 14.4)]
+    image = {"id": 1, "file_name": f"{camera}.png", "width": 640, "height": 480}
+    numbers = [value for x, y in places for value in (200.0 + 10.0 * x, 300.0 - 10.0 * y, 2)]
+    marked = {"id": 1, "image_id": 1, "category_id": 1, "keypoints": numbers}
+    named = {"id": 1, "name": "pitch", "keypoints": [f"{x:.2f}, {y}" for x, y in places]}
+    content = {"images": [image], "annotations": [marked], "categories": [named]}
+    file.write_text(json.dumps(content))
+    return str(file)
+
+
+def test_points_join_the_pitch_before_the_first_run_and_are_refused_unwritten_after(
+    store, tmp_path
+):
+    folder = made(tmp_path / "a", "a")
+    assert said(store, "ingest", str(folder)).exit_code == 0
+    first, second = (clicks_of_places(tmp_path / f"{n}.json", "cam1", n) for n in (0, 1))
+    words = ["import", "--out", str(folder), "--clicks"]
+    assert said(store, *words, first).exit_code == 0
+    answer = said(store, "ingest", str(folder))
+    assert (answer.exit_code, answer.stdout.splitlines()[0]) == (0, "registered a")
+    assert "at_3.30_4.40" in open_for_review(store, "a").folder.pitch.points
+
+    store.finish_run(run_record(match_id="a"))
+    (clicks,) = (folder / "annotations" / "static_calibration").iterdir()
+    clicks.unlink()
+    before = sorted(folder.rglob("*"))
+    with pytest.raises(InputError, match=r"a/0001; nothing was written.*gc --delete --forget a/0"):
+        raise said(store, *words, second).exception
+    with pytest.raises(InputError, match="a/0001; nothing was written"):
+        (tmp_path / "survey.csv").write_text("name,x,y\n")
+        pitch, survey = folder / "pitch.json", str(tmp_path / "survey.csv")
+        pitch.rename(tmp_path / "pitch.json")
+        raise said(store, "import", "--pitch", survey, "--out", str(folder)).exception
+    (tmp_path / "pitch.json").rename(folder / "pitch.json")
+    assert sorted(folder.rglob("*")) == before
+    assert said(store, *words, first).exit_code == 0  # the pitch has its points
+    assert said(store, "ingest", str(folder)).exit_code == 0
+    (folder / "pitch.json").write_text((folder / "pitch.json").read_text() + "\n")
+    (folder / "match.yaml").write_text((folder / "match.yaml").read_text() + "\n")
+    with pytest.raises(InputError, match=r"found changes in pitch.json\. Restore"):
+        open_for_review(store, "a")
+    assert said(store, "gc", "--delete", "--forget", "a/0001").exit_code == 0
+    assert open_for_review(store, "a")
