@@ -22,6 +22,7 @@ from worldpose.errors import UsageError, WorldposeError
 from worldpose.formats.calibration_unit import doubt_middle
 from worldpose.ingest.camera_data import import_camera_data
 from worldpose.ingest.clicks import import_clicks
+from worldpose.ingest.footage import uncovered_clips
 from worldpose.ingest.importing import import_lenses, import_match, import_videos
 from worldpose.ingest.match_folder import read_spec, unclicked_clips
 from worldpose.ingest.pose2sim import import_pose2sim
@@ -347,6 +348,8 @@ def ingest(
             line(f"error: {failure}", to=errors)
             continue
         rows.append({"match": match.match_id, "folder": str(folder), "changed": changed})
+        for text in uncovered_clips(match.folder) if changed else ():
+            line(f"warning: {text}", to=errors)
         known = "registered" if changed else "already registered, unchanged:"
         line(f"{known} {match.match_id}")
         _tell_unclicked(match)

@@ -15,6 +15,7 @@ from data_contracts.run import UnitFailure, WaitingUnit
 from flows.cli import run as run_command
 from flows.cli.app import COMMANDS, app, summary
 from flows.registering import open_for_review, register
+from flows.web.draft_folder import build
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.store.store import Store
@@ -198,6 +199,24 @@ def test_of_several_folders_the_good_ones_are_taken_in_and_the_others_said(store
     assert (answer.exit_code, store.matches()) == (4, ("a",))
     assert f"error: {none}" in answer.stderr
     assert said(store, "ingest", good).exit_code == 0
+
+
+@pytest.mark.parametrize(("frames", "is_told"), [(35, False), (36, True), (250, True)])
+def test_a_clip_much_longer_than_its_2d_poses_is_told_where_files_are_given(
+    store, tmp_path, frames, is_told
+):
+    folder = made(tmp_path / "a", "a")
+    content = yaml.safe_load((folder / "match.yaml").read_text())
+    content["clips"][0]["frame_count"] = frames
+    (folder / "match.yaml").write_text(yaml.safe_dump(content))
+    told = f"clip clip: it has frames 0 to {frames - 1}, and 2D poses only in frames 0 to 9."
+    answer = said(store, "ingest", str(folder))
+    assert (answer.exit_code, told in answer.stderr) == (0, is_told)
+    (tmp_path / "draft").mkdir()
+    folder.rename(tmp_path / "draft" / "own")
+    (tmp_path / "draft" / "match").mkdir()
+    _, notes = build(Store.open_or_new(tmp_path / "new"), content, tmp_path / "draft", {})
+    assert any(told in note for note in notes) == is_told
 
 
 def test_a_match_of_the_second_world_is_made_by_name(tmp_path):
