@@ -273,15 +273,20 @@ class UnitChange:
 def find_run(store: Store, name: str) -> RunRecord:
     """Return the run named by `match/number` or `match/name`, or `match` for its latest."""
     match_id, _, number = name.partition("/")
-    runs = store.runs(match_id) if match_id in store.matches() else []
+    is_known = match_id in store.matches()
+    runs = store.runs(match_id) if is_known else ()
     names = {pin.name: pin.run_id for pin in list_pins(store.blobs, match_id)} if runs else {}
+    number = number.zfill(4) if number.isdecimal() else number
     run_id = names.get(number, number) or (runs[-1] if runs else "")
     if run_id not in runs:
+        found = f"runs {', '.join((*runs, *names))}" if runs else "no run of that match"
+        if is_known and run_id in {run.run_id for run in store.unfinished_runs(match_id)}:
+            found = f"run {run_id}, which has not ended; ended: {', '.join(runs) or 'none'}"
         raise InputError(
             name,
             expected=f"MATCH/NUMBER or MATCH/NAME, of {', '.join(store.matches()) or '(none)'}",
-            found=f"runs {', '.join((*runs, *names))}" if runs else "no run of that match",
-            todo="List the runs: worldpose status.",
+            found=found,
+            todo=f"List the runs: worldpose status{f' {match_id}' if is_known else ''}.",
         )
     return store.run(match_id, run_id)
 

@@ -110,7 +110,7 @@ def _describe_active(run: Reservation) -> str:
     return (
         f"Match {run.match_id} is skipped: run {run.run_id} (process {run.pid} on {run.host}), "
         f"started at {run.started_at:%Y-%m-%d %H:%M} UTC, may still be active. If it is dead, "
-        f"forget {run.match_id}/{run.run_id}."
+        f"forget it: worldpose gc --delete --forget {run.match_id}/{run.run_id}"
     )
 
 
@@ -172,7 +172,7 @@ def _check_arguments(store: Store, keep_last: int | None, forget: Collection[str
                 f"run to forget: {name}",
                 expected=f"match/run with one of the runs: {', '.join(sorted(known)) or '(none)'}",
                 found="no such run",
-                todo="List the runs with `worldpose status`.",
+                todo=f"List the runs: worldpose status {match_id}.",
             )
         if run_id in (pinned := _pin_names(store, match_id)):
             raise InputError(
