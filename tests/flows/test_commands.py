@@ -187,6 +187,7 @@ def test_the_exit_code_of_a_run_says_how_it_ended(state, code, told, store, tmp_
     monkeypatch.setattr(run_command, "run_match", lambda *_: ended(state))
     answer = said(store, "run", "a")
     assert (answer.exit_code, told in answer.stdout) == (code, True)
+    assert "1.0 s; the whole command, with the start of Prefect: 0." in answer.stdout
     as_json = said(store, "run", "a", "--json")
     assert as_json.exit_code == code
     assert json.loads(as_json.stdout)["failed"] == (state in ("failed", "partial"))
@@ -199,6 +200,21 @@ def test_of_several_folders_the_good_ones_are_taken_in_and_the_others_said(store
     assert (answer.exit_code, store.matches()) == (4, ("a",))
     assert f"error: {none}" in answer.stderr
     assert said(store, "ingest", good).exit_code == 0
+
+
+def test_a_run_that_has_not_ended_is_told_and_listed(store, tmp_path):
+    register(store, made(tmp_path / "a", "a"), unfinished=True)
+    killed = store.reserve_run("a")
+    store.finish_run(run_record(match_id="a", run_id=store.reserve_run("a")))
+    assert said(store, "diff", "a/2", "a").exit_code == 0
+    told = r"found run 0001, which has not ended; ended: 0002. List the runs: worldpose status a\."
+    with pytest.raises(InputError, match=told):
+        raise said(store, "diff", "a/1", "a/2").exception
+    assert "a: runs: ended 0002; not ended 0001\n" in said(store, "status", "a").stdout
+    assert "forget it: worldpose gc --delete --forget a/0001\n" in said(store, "gc").stdout
+    removed = said(store, "gc", "--delete", "--forget", f"a/{killed}").stdout
+    assert "removed: 1 x reservation of a dead run (" in removed
+    assert "removed: nothing (0 B)" in said(store, "gc", "--delete").stdout
 
 
 @pytest.mark.parametrize(("frames", "is_told"), [(35, False), (36, True), (250, True)])
