@@ -81,13 +81,11 @@ def register(
             is_pitch = {*changed} <= {"pitch.json", spec.pitch, previous.spec.pitch}
             is_free = at_home and (is_pitch or not match.journal.entries)
             if not is_free or runs_of_pitch(store, folder):
-                more = " and more" if len(changed) > 3 else ""
                 raise InputError(
                     f"{folder}: match.yaml: match_id",
-                    expected="the videos, detections and pitch that "
-                    f"{match_id} was registered with",
-                    found=f"changes in {', '.join(changed[:3])}{more}",
-                    todo="Restore the files, or give the changed match a new id.",
+                    f"the videos, detections and pitch that {match_id} was registered with",
+                    f"changes in {', '.join(changed[:3])}" + " and more" * (len(changed) > 3),
+                    "Restore the files, or give the changed match a new id.",
                 )
         if previous == registration:
             return match, False
@@ -308,5 +306,5 @@ def _changed_files(match: MatchFolder, *sides: Registration) -> list[str]:
     """Return the videos, detections and pitch that differ between two registrations."""
     old, new = ({file.path: file.sha256 for file in side.files} for side in sides)
     own = identifying_files(match)
-    gone = {path for path in old.keys() - new.keys() if not path.startswith("annotations/")}
-    return sorted(path for path in own | gone if old.get(path) != new.get(path))
+    own |= {path for path in old.keys() - new.keys() if not path.startswith("annotations/")}
+    return sorted(path for path in own if old.get(path) != new.get(path))

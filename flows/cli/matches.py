@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict
 from math import isnan
 from pathlib import Path
@@ -25,6 +24,7 @@ from worldpose.ingest.clicks import import_clicks
 from worldpose.ingest.footage import uncovered_clips
 from worldpose.ingest.importing import import_lenses, import_match, import_videos
 from worldpose.ingest.match_folder import read_spec, unclicked_clips
+from worldpose.ingest.pitch_file import require_free_pitch
 from worldpose.ingest.pose2sim import import_pose2sim
 from worldpose.ingest.writing import import_boxes
 from worldpose.store.store import Store
@@ -124,8 +124,8 @@ def import_command(
         about = {"file": str(target), "rows": len(data.frame), "notes": list(data.notes)}
         answer(about, f"wrote {target}: {len(data.frame)} rows", *data.notes)
     elif kind == "--pitch" and pitch is not None:
-        runs = runs_of_pitch(Store.open_or_new(project), out)
-        import_pitch(pitch, template, out, runs, left_handed=left_handed)
+        require_free_pitch(out, runs_of_pitch(Store.open_or_new(project), out))
+        import_pitch(pitch, template, out, left_handed=left_handed)
     elif challenge is not None:
         _import_challenge(challenge, out, fps)
     elif pose2sim is not None:
@@ -171,9 +171,9 @@ ALONE: Final = {
         ("--camera", "--first-frame", "--freed-camera", "--zoom-table"),
     ),
     "--camera": ("with --clicks, --lens or --camera-data", ()),
-    "--first-frame": ("with --camera-data", ()),
-    "--freed-camera": ("with --camera-data", ()),
-    "--zoom-table": ("with --camera-data", ()),
+    **dict.fromkeys(
+        ("--first-frame", "--freed-camera", "--zoom-table"), ("with --camera-data", ())
+    ),
     "--pitch": ("with --out alone", ("--left-handed", "--template")),
     "--template": ("with --pitch", ()),
     "--left-handed": ("with --pitch", ()),
@@ -271,16 +271,10 @@ def _import_clicks(file: Path, out: Path, camera: str | None, store: Store) -> N
 
 
 def import_pitch(
-    survey: Path,
-    template: TemplateName | None,
-    out: Path,
-    runs: Sequence[str],
-    *,
-    left_handed: bool,
+    survey: Path, template: TemplateName | None, out: Path, *, left_handed: bool
 ) -> None:
     """Align a survey with the world frame, write pitch.json and print the residuals."""
     from worldpose.formats.files import whole_file
-    from worldpose.ingest.pitch_file import require_free_pitch
     from worldpose.pitch.survey import SurveySettings, fit_survey, read_survey
 
     file = out / "pitch.json"
@@ -291,7 +285,6 @@ def import_pitch(
             found="one",
             todo="Move the file away first; another pitch makes another match.",
         )
-    require_free_pitch(out, runs)
     fit = fit_survey(
         read_survey(survey, template or "football"), SurveySettings(left_handed=left_handed)
     )

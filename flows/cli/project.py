@@ -101,9 +101,8 @@ def _print_status(rows: Sequence[Mapping[str, Any]]) -> None:
         if row["waiting"]:
             console.line(f"{row['match']}: pending reviews: worldpose review list {row['match']}")
         if len(rows) == 1:
-            ends = (("ended", row["runs"]), ("not ended", row["unfinished_runs"]))
-            said = (f"{end} {', '.join(runs)}" for end, runs in ends if runs)
-            console.line(f"{row['match']}: runs: {'; '.join(said) or 'none'}")
+            ended, others = (", ".join(row[key]) or "none" for key in ("runs", "unfinished_runs"))
+            console.line(f"{row['match']}: runs that ended: {ended}; that have not: {others}")
         for name, run_id in row["pins"].items():
             console.line(f"{row['match']}: run {run_id} is pinned as {name}")
         if row["settings"]:
@@ -118,12 +117,12 @@ STATES = tuple(state.value for state in UnitState)
 
 def _match_status(store: Store, match_id: str) -> dict[str, Any]:
     """Return one match's status; what cannot be read is its problem, and hides no other match."""
-    found, pins, unfinished = read_summary(store, match_id), {}, list[str]()
-    runs: tuple[str, ...] = ()
+    found, pins = read_summary(store, match_id), {}
+    runs, unfinished = list[str](), list[str]()
     latest, problem = found.latest, found.problem or (found.words == UNREADABLE and found.why)
     said = problem
     try:
-        runs = store.runs(match_id)
+        runs = [*store.runs(match_id)]
         unfinished = [run.run_id for run in store.unfinished_runs(match_id)]
         pins = {pin.name: pin.run_id for pin in list_pins(store.blobs, match_id)}
     except (OSError, WorldposeError) as error:

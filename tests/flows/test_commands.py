@@ -207,10 +207,10 @@ def test_a_run_that_has_not_ended_is_told_and_listed(store, tmp_path):
     killed = store.reserve_run("a")
     store.finish_run(run_record(match_id="a", run_id=store.reserve_run("a")))
     assert said(store, "diff", "a/2", "a").exit_code == 0
-    told = r"found run 0001, which has not ended; ended: 0002. List the runs: worldpose status a\."
+    told = r"run 1 of match a .*one of 0002, found an unfinished run. List them: worldpose status a"
     with pytest.raises(InputError, match=told):
         raise said(store, "diff", "a/1", "a/2").exception
-    assert "a: runs: ended 0002; not ended 0001\n" in said(store, "status", "a").stdout
+    assert "a: runs that ended: 0002; that have not: 0001\n" in said(store, "status", "a").stdout
     assert "forget it: worldpose gc --delete --forget a/0001\n" in said(store, "gc").stdout
     removed = said(store, "gc", "--delete", "--forget", f"a/{killed}").stdout
     assert "removed: 1 x reservation of a dead run (" in removed

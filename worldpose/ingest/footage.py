@@ -138,17 +138,15 @@ def uncovered_clips(match: MatchFolder) -> Iterator[str]:
 
     Shorter times without people are no reason for a reservation either (`UsableLimits`).
     """
-    spec, static = match.spec, [camera.id for camera in match.spec.static_cameras]
-    seen: dict[str, NDArray[np.int64]] = {}
+    spec, seen = match.spec, dict[str, NDArray[np.int64]]()
+    for unit in match.detections:
+        people, _ = read_unit(match, unit)
+        seen[unit] = people.frame[np.isfinite(people.score).any(axis=1)]
     for clip in spec.clips:
-        units = [*static, *spec.views_of(clip.id)]
-        if not match.detections.keys() >= {*units}:
+        units = [*(camera.id for camera in spec.static_cameras), *spec.views_of(clip.id)]
+        if not {*units} <= seen.keys():
             continue  # a detector finds the people of the others
         first, last = clip.first_frame, clip.first_frame + clip.frame_count - 1
-        for unit in units:
-            if unit not in seen:
-                people, _ = read_unit(match, unit)
-                seen[unit] = people.frame[np.isfinite(people.score).any(axis=1)]
         frame = np.concatenate([seen[unit] for unit in units])
         frame = frame[(frame >= first) & (frame <= last)]
         begin, end = (int(frame.min()), int(frame.max())) if len(frame) else (last + 1, last)

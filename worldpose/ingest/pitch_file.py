@@ -135,12 +135,8 @@ def _is_number(value: object) -> TypeGuard[float]:
 def require_free_pitch(folder: Path, runs: Sequence[str] = ()) -> None:
     """Raise InputError if pitch.json must not be written.
 
-    Args:
-        folder: the match folder.
-        runs: MATCH/NUMBER of the runs that were computed with its pitch.
-
     Raises:
-        InputError: match.yaml names another pitch, or none; or there are runs.
+        InputError: match.yaml names another pitch, or none; or `runs` (MATCH/NUMBER) had its pitch.
     """
     file = folder / "match.yaml"
     content = read_yaml(file) if file.exists() else None

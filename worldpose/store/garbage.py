@@ -11,7 +11,7 @@ from data_contracts.run import Reservation, RunRecord
 from worldpose.errors import CorruptionError, InputError, StoreError
 from worldpose.store.blobs import Entry
 from worldpose.store.paths import MANIFEST, ResultId, is_name, record_path, reservation_path
-from worldpose.store.runs import list_pins, may_be_running, run_order
+from worldpose.store.runs import list_pins, may_be_running, run_files, run_order
 from worldpose.store.store import Store
 
 
@@ -163,11 +163,8 @@ def _check_arguments(store: Store, keep_last: int | None, forget: Collection[str
         )
     for name in forget:
         match_id, _, run_id = name.partition("/")
-        known = {
-            *store.runs(match_id),
-            *(open_run.run_id for open_run in store.unfinished_runs(match_id)),
-        }
-        if run_id not in known:
+        finished, reserved, _ = run_files(store.blobs, match_id)
+        if run_id not in (known := finished | reserved):
             raise InputError(
                 f"run to forget: {name}",
                 expected=f"match/run with one of the runs: {', '.join(sorted(known)) or '(none)'}",
