@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from data_contracts.match import MatchSpec, Registration, SourceFile
+from data_contracts.match import MatchSpec, Registration
 from flows.layers import pitch_in_words, pitch_of_run, read_layers
 from flows.review.corrections import corrected_match
 from flows.stage import Match
@@ -16,10 +16,11 @@ from worldpose.errors import CorruptionError, InputError
 from worldpose.formats.detection_files import read_boxes
 from worldpose.ingest.footage import read_still, read_unit, require_footage
 from worldpose.ingest.match_folder import MatchFolder, read_match, read_spec, require_calibrated
-from worldpose.ingest.registration import READERS, register_match
+from worldpose.ingest.registration import READERS, identifying_files, register_match
 from worldpose.ingest.validation import reachable
 from worldpose.review.journal import read_journal
 from worldpose.store.paths import is_name
+from worldpose.store.runs import may_be_running
 from worldpose.store.store import Run, Store
 
 if TYPE_CHECKING:
@@ -38,7 +39,8 @@ def register(
 
     The same content under another name is the same match. A known match with changed videos,
     detections or pitch is another match and needs another id, unless it is the next version of the
-    folder that it `replaces`: then runs, corrections and names stay. `unfinished` accepts it
+    folder that it `replaces`: then runs, corrections and names stay. Before its first run it stays
+    the same match, if only its pitch changed or it has no corrections. `unfinished` accepts it
     without all cameras known; people click them on the pages. `known_as` is the id that the folder
     must have.
     """
@@ -75,18 +77,31 @@ def register(
         require_calibrated(match.folder)
     if previous is not None:
         if previous.identity != registration.identity and not is_next:
-            raise InputError(
-                f"{folder}: match.yaml: match_id",
-                expected=f"the videos, detections and pitch that {match_id} was registered with",
-                found=_changes(previous.files, registration.files),
-                todo="Restore the files, or give the changed match a new id.",
-            )
+            changed = _changed_files(match_folder, previous, registration)
+            is_pitch = {*changed} <= {"pitch.json", spec.pitch, previous.spec.pitch}
+            is_free = at_home and (is_pitch or not match.journal.entries)
+            if not is_free or runs_of_pitch(store, folder):
+                raise InputError(
+                    f"{folder}: match.yaml: match_id",
+                    f"the videos, detections and pitch that {match_id} was registered with",
+                    f"changes in {', '.join(changed[:3])}" + " and more" * (len(changed) > 3),
+                    "Restore the files, or give the changed match a new id.",
+                )
         if previous == registration:
             return match, False
     _refuse_duplicate(store, registration, is_next=is_next)
     _read_new_files(match_folder, registration, previous)
     store.register(registration)
     return match, True
+
+
+def runs_of_pitch(store: Store, folder: Path) -> list[str]:
+    """Return MATCH/NUMBER of the runs of a folder's match that have ended or may be active."""
+    if not (folder / "match.yaml").exists():
+        return []
+    match_id = read_spec(folder).match_id
+    active = [run.run_id for run in store.unfinished_runs(match_id) if may_be_running(run)]
+    return [f"{match_id}/{run_id}" for run_id in (*store.runs(match_id), *active)]
 
 
 def register_next(folder: MatchFolder, before: Registration) -> Registration:
@@ -287,8 +302,9 @@ def _of_footage(spec: MatchSpec) -> MatchSpec:
     return spec.model_copy(update={"clips": clips, "roster": (), "venue": None})
 
 
-def _changes(before: tuple[SourceFile, ...], after: tuple[SourceFile, ...]) -> str:
-    old = {source.path: source.sha256 for source in before}
-    new = {source.path: source.sha256 for source in after}
-    changed = sorted(path for path in old | new if old.get(path) != new.get(path))
-    return f"changes in {', '.join(changed[:3])}" + (" and more" if len(changed) > 3 else "")
+def _changed_files(match: MatchFolder, *sides: Registration) -> list[str]:
+    """Return the videos, detections and pitch that differ between two registrations."""
+    old, new = ({file.path: file.sha256 for file in side.files} for side in sides)
+    own = identifying_files(match)
+    own |= {path for path in old.keys() - new.keys() if not path.startswith("annotations/")}
+    return sorted(path for path in own if old.get(path) != new.get(path))

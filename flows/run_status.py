@@ -16,14 +16,14 @@ from data_contracts.run import GatePolicy, RunRecord
 from data_contracts.work import Recipe
 from flows.gates import Gatekeeper
 from flows.method import METHOD, unit_order
-from flows.registering import open_match
+from flows.registering import find_registration, open_match
 from flows.run_plan import PlannedUnit, plan_ahead, plan_run
 from flows.run_record import latest_run
 from flows.settings import Overrides, ResolvedSettings, resolve, selected_stages
 from flows.stage import Match
 from worldpose.errors import InputError, StoreError
 from worldpose.store.recipes import RecipeDifference, recipe_differences
-from worldpose.store.runs import list_pins
+from worldpose.store.runs import LATEST
 from worldpose.store.store import Run, Store
 
 TEMPORARY_ERRORS: Final = frozenset(
@@ -273,17 +273,7 @@ class UnitChange:
 def find_run(store: Store, name: str) -> RunRecord:
     """Return the run named by `match/number` or `match/name`, or `match` for its latest."""
     match_id, _, number = name.partition("/")
-    runs = store.runs(match_id) if match_id in store.matches() else []
-    names = {pin.name: pin.run_id for pin in list_pins(store.blobs, match_id)} if runs else {}
-    run_id = names.get(number, number) or (runs[-1] if runs else "")
-    if run_id not in runs:
-        raise InputError(
-            name,
-            expected=f"MATCH/NUMBER or MATCH/NAME, of {', '.join(store.matches()) or '(none)'}",
-            found=f"runs {', '.join((*runs, *names))}" if runs else "no run of that match",
-            todo="List the runs: worldpose status.",
-        )
-    return store.run(match_id, run_id)
+    return store.run(find_registration(store, match_id).spec.match_id, number or LATEST)
 
 
 def run_difference(store: Store, a: RunRecord, b: RunRecord) -> list[UnitChange]:

@@ -78,7 +78,8 @@ the video of {unit} has no image, or none that can be decoded, for {value} of th
 Check the video and its offset, or convert it with any video tool.
 
 tracking absent_share max_absent_share
-people are missing in {unit} for {value} of the time{when}. Look at the videos there.
+people are missing in {unit} for {value} of the time{when}. Look at the videos,
+or the given 2D poses, there.
 
 tracking unmatched_share max_unmatched_share required
 no track follows {value} of the people found in the images of {unit}. Look for people beside the
@@ -294,7 +295,10 @@ def _reasons_against(outcome: RunOutcome, limits: UsableLimits) -> Iterator[str]
         stage, _, unit = name.partition("/")
         if stage == "tracking" and own.get("absent_share", 0.0) > most:
             share = f"{quantity('absent_share', most)} of the time"
-            yield f"people are missing in {unit} for more than {share}. Check the videos."
+            yield (
+                f"people are missing in {unit} for more than {share}. Check the videos, or the "
+                "given 2D poses."
+            )
         if stage == "tracking" and own.get("unmatched_share", 0.0) > most:
             yield (
                 f"no track follows more than {quantity('unmatched_share', most)} of the people "

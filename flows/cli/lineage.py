@@ -121,7 +121,8 @@ def timings(store: Store, match: str, run: str = "latest") -> None:
     ]
     for name, seconds in (("start", found.start), ("between units", found.between)):
         rows.append(f"{name}\t\t{seconds:.2f}\t{percent * seconds:.1f}\t\t")
-    console.print_table(f"run {found.run_id}, {found.seconds:.1f} s", columns, rows)
+    title = f"run {found.run_id}, {found.seconds:.1f} s after the start of Prefect"
+    console.print_table(title, columns, rows)
     console.line(f"all its results, also those of earlier runs: {found.cost}")
     if not found.stages:
         console.line("nothing was computed by this run; --run names another")

@@ -319,19 +319,19 @@ def _offset_text(offset: ClockOffset) -> str:
 def _print_offsets(offsets: ClockOffsets, plot: Path | None, *, applied: bool) -> None:
     """Print a table of the offsets, and what to do with them."""
     changed = offsets.changed
-    shown = [
-        (
-            row.camera,
-            _offset_text(row.stated),
-            "-" if row.found is None else f"{round(row.found, 2) + 0.0:.2f}",  # never -0.00
-            "-" if row.std is None else f"{row.std:.2f}",
-            "-" if row.found is None else _offset_text(row.proposed),
-            row.reason if row.relative_to is None else f"relative to {row.relative_to}",
-        )
-        for row in offsets.rows
-    ]
+    shown = []
+    for row in offsets.rows:
+        about = row.reason if row.relative_to is None else f"relative to {row.relative_to}"
+        by_people = row.found, row.std
+        if row.camera == row.relative_to:
+            about, by_people = "the reference: its offset stays", (None, None)
+        texts = [
+            "-" if each is None else f"{round(each, 2) + 0.0:.2f}" for each in by_people
+        ]  # no -0
+        proposed = "-" if row.found is None else _offset_text(row.proposed)
+        shown.append((row.camera, _offset_text(row.stated), *texts, proposed, about))
     head = ("camera", ">offset_frames", ">by the people", ">standard deviation", ">proposed", "")
-    console.print_table("clock offsets of the cameras", head, shown)
+    console.print_table("clock offsets, in frames of each camera", head, shown)
     if plot is not None:
         console.line(f"wrote {plot}")
     if not changed:

@@ -15,14 +15,16 @@ from data_contracts.pitch import TemplateName
 from flows.cli.console import answer, errors, line, print_json, print_table
 from flows.cli.options import DEFAULT_PROJECT, given_options
 from flows.layers import known_pitch
-from flows.registering import register
+from flows.registering import register, runs_of_pitch
 from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.formats.calibration_unit import doubt_middle
 from worldpose.ingest.camera_data import import_camera_data
 from worldpose.ingest.clicks import import_clicks
+from worldpose.ingest.footage import uncovered_clips
 from worldpose.ingest.importing import import_lenses, import_match, import_videos
 from worldpose.ingest.match_folder import read_spec, unclicked_clips
+from worldpose.ingest.pitch_file import require_free_pitch
 from worldpose.ingest.pose2sim import import_pose2sim
 from worldpose.ingest.writing import import_boxes
 from worldpose.store.store import Store
@@ -122,6 +124,7 @@ def import_command(
         about = {"file": str(target), "rows": len(data.frame), "notes": list(data.notes)}
         answer(about, f"wrote {target}: {len(data.frame)} rows", *data.notes)
     elif kind == "--pitch" and pitch is not None:
+        require_free_pitch(out, runs_of_pitch(Store.open_or_new(project), out))
         import_pitch(pitch, template, out, left_handed=left_handed)
     elif challenge is not None:
         _import_challenge(challenge, out, fps)
@@ -168,9 +171,9 @@ ALONE: Final = {
         ("--camera", "--first-frame", "--freed-camera", "--zoom-table"),
     ),
     "--camera": ("with --clicks, --lens or --camera-data", ()),
-    "--first-frame": ("with --camera-data", ()),
-    "--freed-camera": ("with --camera-data", ()),
-    "--zoom-table": ("with --camera-data", ()),
+    **dict.fromkeys(
+        ("--first-frame", "--freed-camera", "--zoom-table"), ("with --camera-data", ())
+    ),
     "--pitch": ("with --out alone", ("--left-handed", "--template")),
     "--template": ("with --pitch", ()),
     "--left-handed": ("with --pitch", ()),
@@ -244,7 +247,8 @@ def _import_lenses(files: list[Path], out: Path, camera: str | None) -> None:
 
 def _import_clicks(file: Path, out: Path, camera: str | None, store: Store) -> None:
     """Write clicks and own points into a match folder, and print what was read."""
-    found = import_clicks(file, out, camera, known_pitch(store, out, read_spec(out)))
+    pitch = known_pitch(store, out, read_spec(out))
+    found = import_clicks(file, out, camera, pitch, runs_of_pitch(store, out))
     questions = []
     if found.repeated:
         from flows.review.repeated_clicks import explain_repeated  # late: it loads the estimators
@@ -271,7 +275,6 @@ def import_pitch(
 ) -> None:
     """Align a survey with the world frame, write pitch.json and print the residuals."""
     from worldpose.formats.files import whole_file
-    from worldpose.ingest.pitch_file import refuse_unread_pitch
     from worldpose.pitch.survey import SurveySettings, fit_survey, read_survey
 
     file = out / "pitch.json"
@@ -282,7 +285,6 @@ def import_pitch(
             found="one",
             todo="Move the file away first; another pitch makes another match.",
         )
-    refuse_unread_pitch(out)
     fit = fit_survey(
         read_survey(survey, template or "football"), SurveySettings(left_handed=left_handed)
     )
@@ -339,6 +341,8 @@ def ingest(
             line(f"error: {failure}", to=errors)
             continue
         rows.append({"match": match.match_id, "folder": str(folder), "changed": changed})
+        for text in uncovered_clips(match.folder) if changed else ():
+            line(f"warning: {text}", to=errors)
         known = "registered" if changed else "already registered, unchanged:"
         line(f"{known} {match.match_id}")
         _tell_unclicked(match)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Annotated, Any
@@ -13,6 +14,7 @@ from flows.cli import console
 from flows.match_state import UNREADABLE
 from flows.overview import PAGE, read_summary
 from flows.registering import find_registration
+from flows.results.timings import in_bytes
 from flows.run_status import UnitState, find_run
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.store.garbage import collect, plan_gc
@@ -98,6 +100,9 @@ def _print_status(rows: Sequence[Mapping[str, Any]]) -> None:
             console.line(f"{row['match']}: {row['now']}. {row['why']} {row['todo']}")
         if row["waiting"]:
             console.line(f"{row['match']}: pending reviews: worldpose review list {row['match']}")
+        if len(rows) == 1:
+            ended, others = (", ".join(row[key]) or "none" for key in ("runs", "unfinished_runs"))
+            console.line(f"{row['match']}: runs that ended: {ended}; that have not: {others}")
         for name, run_id in row["pins"].items():
             console.line(f"{row['match']}: run {run_id} is pinned as {name}")
         if row["settings"]:
@@ -112,10 +117,12 @@ STATES = tuple(state.value for state in UnitState)
 
 def _match_status(store: Store, match_id: str) -> dict[str, Any]:
     """Return one match's status; what cannot be read is its problem, and hides no other match."""
-    found, pins, unfinished = read_summary(store, match_id), {}, list[str]()
+    found, pins = read_summary(store, match_id), {}
+    runs, unfinished = list[str](), list[str]()
     latest, problem = found.latest, found.problem or (found.words == UNREADABLE and found.why)
     said = problem
     try:
+        runs = [*store.runs(match_id)]
         unfinished = [run.run_id for run in store.unfinished_runs(match_id)]
         pins = {pin.name: pin.run_id for pin in list_pins(store.blobs, match_id)}
     except (OSError, WorldposeError) as error:
@@ -134,6 +141,7 @@ def _match_status(store: Store, match_id: str) -> dict[str, Any]:
         "usability": latest.usability.model_dump(mode="json") if latest else None,
         "waiting": [each.unit for each in found.waiting],
         "settings": found.settings,
+        "runs": runs,
         "unfinished_runs": unfinished,
         "pins": pins,
         "problem": said or None,
@@ -203,12 +211,13 @@ def gc(
     )
     freed = collect(store, plan) if delete else 0
     rows = [{"path": g.path, "reason": g.reason, "bytes": g.size} for g in plan.garbage]
-    verb = "removed" if delete else "no run reaches"
+    counts = Counter(garbage.reason for garbage in plan.garbage)
+    told = ", ".join(f"{count} x {reason}" for reason, count in counts.items()) or "nothing"
     console.answer(
         {"garbage": rows, "held": plan.held, "bytes": plan.size, "freed": freed},
         *(f"{garbage.path}  {garbage.reason}" for garbage in plan.garbage),
         *plan.held,
-        f"{verb} {len(plan.garbage)} things, {plan.size / 1e6:.1f} MB",
+        f"{'removed' if delete else 'to remove with --delete'}: {told} ({in_bytes(plan.size)})",
     )
 
 

@@ -161,7 +161,8 @@ def _print(record: RunRecord, project: str, seconds: float) -> None:
     console.line(
         f"run {record.run_id} of {record.match_id} is {record.state}: "
         f"{len(record.executed)} computed, {len(record.reused)} reused, "
-        f"{len(record.failed)} failed{blocked}, gates {record.gates}, {seconds:.1f} s"
+        f"{len(record.failed)} failed{blocked}, gates {record.gates}, {record.seconds:.1f} s; "
+        f"the whole command, with the start of Prefect: {seconds:.1f} s"
     )
     count = len(record.usability.reservations)
     verdict = f"{record.usability.verdict}{f' ({count} below)' if count else ''}"

@@ -38,6 +38,7 @@ from flows.web.draft_problems import (
 )
 from worldpose.errors import InputError
 from worldpose.formats.files import read_yaml
+from worldpose.ingest.footage import uncovered_clips
 from worldpose.ingest.match_folder import MatchFolder, read_match, read_spec
 from worldpose.ingest.registration import register_match
 from worldpose.ingest.validation import reachable
@@ -153,6 +154,7 @@ def build(
         # No paths of this machine, no options of commands.
         notes = [re.sub(r"; --\w+ states another", "", it.replace(f"{given}/", "")) for it in taken]
         match = read_match(folder, (), *pitch_in_words(store, folder, read_spec(folder)))
+        notes += uncovered_clips(match)
     except InputError as error:
         return [describe(error, folder, given)], notes
     owners = {*(each.id for each in match.spec.cameras), *match.spec.broadcast_views}

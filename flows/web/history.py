@@ -129,7 +129,8 @@ def _find_run(store: Store, match_id: str, run_id: str) -> RunRecord:
 def _find_cause(match: Match, record: RunRecord, parent: RunRecord | None) -> str:
     """Return why a run was made, by what differs from the run before it."""
     if parent is None:
-        return "the run before was removed" if record.parent else "first run"
+        first = "first run" + " that ended" * (int(record.run_id) > 1)
+        return "the run before was removed" if record.parent else first
     made = corrections_since(match.journal, parent.started_at, record.started_at)
     causes = [f"{made} {'correction' if made == 1 else 'corrections'}"] if made > 0 else []
     causes += ["other settings"] if parent.overrides != record.overrides else []

@@ -14,9 +14,10 @@ from typer.testing import CliRunner
 
 from data_contracts.cameras import LensCalibration
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
+from flows.cli import console
 from flows.cli.app import app
-from flows.cli.locate import _lens
-from flows.results.clock_offsets import propose
+from flows.cli.locate import _lens, _print_offsets
+from flows.results.clock_offsets import ClockOffsets, Proposal, propose
 from flows.run_record import latest_run
 from flows.service.inbox import run_key, take_in, watch_once
 from flows.service.layout import served_state
@@ -60,6 +61,19 @@ def test_an_offset_is_found_drawn_and_written(server, shifted, tmp_path):
     cameras = yaml.safe_load((shifted / "match.yaml").read_text())["cameras"]
     assert [camera.get("offset_frames", 0) for camera in cameras] == [0] * len(cameras)
     assert "match.yaml needs no change" in succeed("synchronize", shifted, *options[:2]).out
+
+
+def test_the_table_of_offsets_names_the_reference_and_the_unit(monkeypatch):
+    rows = [Proposal(name, 4, 4.0, 0.5, 4, "", "left") for name in ("left", "right")]
+    printed = []
+    monkeypatch.setattr(console, "print_table", lambda *table: printed.extend(table))
+    _print_offsets(ClockOffsets("clip", ["left", "right"], None, rows), None, applied=False)
+    title, _, shown = printed
+    assert "in frames of each camera" in title
+    assert shown == [
+        ("left", "4", "-", "-", "4", "the reference: its offset stays"),
+        ("right", "4", "4.00", "0.50", "4", "relative to left"),
+    ]
 
 
 @pytest.mark.slow

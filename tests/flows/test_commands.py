@@ -15,6 +15,7 @@ from data_contracts.run import UnitFailure, WaitingUnit
 from flows.cli import run as run_command
 from flows.cli.app import COMMANDS, app, summary
 from flows.registering import open_for_review, register
+from flows.web.draft_folder import build
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.store.store import Store
@@ -186,6 +187,7 @@ def test_the_exit_code_of_a_run_says_how_it_ended(state, code, told, store, tmp_
     monkeypatch.setattr(run_command, "run_match", lambda *_: ended(state))
     answer = said(store, "run", "a")
     assert (answer.exit_code, told in answer.stdout) == (code, True)
+    assert "1.0 s; the whole command, with the start of Prefect: 0." in answer.stdout
     as_json = said(store, "run", "a", "--json")
     assert as_json.exit_code == code
     assert json.loads(as_json.stdout)["failed"] == (state in ("failed", "partial"))
@@ -198,6 +200,39 @@ def test_of_several_folders_the_good_ones_are_taken_in_and_the_others_said(store
     assert (answer.exit_code, store.matches()) == (4, ("a",))
     assert f"error: {none}" in answer.stderr
     assert said(store, "ingest", good).exit_code == 0
+
+
+def test_a_run_that_has_not_ended_is_told_and_listed(store, tmp_path):
+    register(store, made(tmp_path / "a", "a"), unfinished=True)
+    killed = store.reserve_run("a")
+    store.finish_run(run_record(match_id="a", run_id=store.reserve_run("a")))
+    assert said(store, "diff", "a/2", "a").exit_code == 0
+    told = r"run 1 of match a .*one of 0002, found an unfinished run. List them: worldpose status a"
+    with pytest.raises(InputError, match=told):
+        raise said(store, "diff", "a/1", "a/2").exception
+    assert "a: runs that ended: 0002; that have not: 0001\n" in said(store, "status", "a").stdout
+    assert "forget it: worldpose gc --delete --forget a/0001\n" in said(store, "gc").stdout
+    removed = said(store, "gc", "--delete", "--forget", f"a/{killed}").stdout
+    assert "removed: 1 x reservation of a dead run (" in removed
+    assert "removed: nothing (0 B)" in said(store, "gc", "--delete").stdout
+
+
+@pytest.mark.parametrize(("frames", "is_told"), [(35, False), (36, True), (250, True)])
+def test_a_clip_much_longer_than_its_2d_poses_is_told_where_files_are_given(
+    store, tmp_path, frames, is_told
+):
+    folder = made(tmp_path / "a", "a")
+    content = yaml.safe_load((folder / "match.yaml").read_text())
+    content["clips"][0]["frame_count"] = frames
+    (folder / "match.yaml").write_text(yaml.safe_dump(content))
+    told = f"clip clip: it has frames 0 to {frames - 1}, and 2D poses only in frames 0 to 9."
+    answer = said(store, "ingest", str(folder))
+    assert (answer.exit_code, told in answer.stderr) == (0, is_told)
+    (tmp_path / "draft").mkdir()
+    folder.rename(tmp_path / "draft" / "own")
+    (tmp_path / "draft" / "match").mkdir()
+    _, notes = build(Store.open_or_new(tmp_path / "new"), content, tmp_path / "draft", {})
+    assert any(told in note for note in notes) == is_told
 
 
 def test_a_match_of_the_second_world_is_made_by_name(tmp_path):
@@ -230,3 +265,50 @@ def test_a_match_whose_folder_has_moved_says_how_it_goes_on_and_does(store, tmp_
         open_for_review(store, "a")
     register(store, tmp_path / "b", unfinished=True)
     assert open_for_review(store, "a").folder.folder == tmp_path / "b"
+
+
+def clicks_of_places(file, camera, shift):
+    """Labelled places [m] in an image of a camera, of which the pitch names none."""
+    places = [(x + shift, y) for x in (-13.3, 3.3) for y in (4.4, 14.4)]
+    image = {"id": 1, "file_name": f"{camera}.png", "width": 640, "height": 480}
+    numbers = [value for x, y in places for value in (200.0 + 10.0 * x, 300.0 - 10.0 * y, 2)]
+    marked = {"id": 1, "image_id": 1, "category_id": 1, "keypoints": numbers}
+    named = {"id": 1, "name": "pitch", "keypoints": [f"{x:.2f}, {y}" for x, y in places]}
+    content = {"images": [image], "annotations": [marked], "categories": [named]}
+    file.write_text(json.dumps(content))
+    return str(file)
+
+
+def test_points_join_the_pitch_before_the_first_run_and_are_refused_unwritten_after(
+    store, tmp_path
+):
+    folder = made(tmp_path / "a", "a")
+    assert said(store, "ingest", str(folder)).exit_code == 0
+    first, second = (clicks_of_places(tmp_path / f"{n}.json", "cam1", n) for n in (0, 1))
+    words = ["import", "--out", str(folder), "--clicks"]
+    assert said(store, *words, first).exit_code == 0
+    answer = said(store, "ingest", str(folder))
+    assert (answer.exit_code, answer.stdout.splitlines()[0]) == (0, "registered a")
+    assert "at_3.30_4.40" in open_for_review(store, "a").folder.pitch.points
+
+    store.finish_run(run_record(match_id="a"))
+    (clicks,) = (folder / "annotations" / "static_calibration").iterdir()
+    clicks.unlink()
+    before = sorted(folder.rglob("*"))
+    with pytest.raises(InputError, match=r"a/0001; nothing was written.*gc --delete --forget a/0"):
+        raise said(store, *words, second).exception
+    with pytest.raises(InputError, match="a/0001; nothing was written"):
+        (tmp_path / "survey.csv").write_text("name,x,y\n")
+        pitch, survey = folder / "pitch.json", str(tmp_path / "survey.csv")
+        pitch.rename(tmp_path / "pitch.json")
+        raise said(store, "import", "--pitch", survey, "--out", str(folder)).exception
+    (tmp_path / "pitch.json").rename(folder / "pitch.json")
+    assert sorted(folder.rglob("*")) == before
+    assert said(store, *words, first).exit_code == 0  # the pitch has its points
+    assert said(store, "ingest", str(folder)).exit_code == 0
+    (folder / "pitch.json").write_text((folder / "pitch.json").read_text() + "\n")
+    (folder / "match.yaml").write_text((folder / "match.yaml").read_text() + "\n")
+    with pytest.raises(InputError, match=r"found changes in pitch.json\. Restore"):
+        open_for_review(store, "a")
+    assert said(store, "gc", "--delete", "--forget", "a/0001").exit_code == 0
+    assert open_for_review(store, "a")

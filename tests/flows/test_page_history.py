@@ -43,12 +43,15 @@ def test_runs_are_listed_compared_and_kept_by_name(ada, project_copy, monkeypatc
     assert "tracking.x = 1" in late["settings"]
     store.finish_run(first.model_copy(update={"run_id": store.reserve_run(TINY), "parent": "0"}))
     assert ada.get(f"{MATCH}/runs").json()[0]["cause"] == "the run before was removed"
+    # Its number tells that another one began before, and was killed.
+    store.finish_run(first.model_copy(update={"run_id": store.reserve_run(TINY), "parent": None}))
+    assert ada.get(f"{MATCH}/runs").json()[0]["cause"] == "first run that ended"
     (worse,) = ada.get(f"{MATCH}/runs/0001/0002").json()
     assert (worse["kind"], worse["name"], worse["mark"]) == ("camera", "cam00", "worse")
     assert ada.get(f"{MATCH}/runs/0001/0009").status_code == 404
     pin = {"run": "0001", "name": "v1"}
     assert ada.post(f"{MATCH}/pins", json=pin).status_code == 200
-    assert ada.get(f"{MATCH}/runs").json()[2]["pins"] == ["v1"]
+    assert ada.get(f"{MATCH}/runs").json()[3]["pins"] == ["v1"]
     # Neither needs the match folder.
     monkeypatch.setattr(registering, "_is_there", lambda folder: False)
     assert ada.post(f"{MATCH}/pins/v1/removal", json={}).status_code == 200

@@ -141,9 +141,9 @@ def test_a_pinned_run_has_a_name_and_stays(command, project_copy):
     assert {each["mark"] for each in compared} == {"unchanged"}
     with pytest.raises(InputError, match="not pinned"):
         command("gc", "--forget", f"{TINY}/0001")
-    assert "removed 0 things" in command("gc", "--keep-last", "1", "--delete").stdout
+    assert "removed: nothing (0 B)" in command("gc", "--keep-last", "1", "--delete").stdout
     assert command("unpin", f"{TINY}/paper").exit_code == 0
-    assert "removed 1 things" in command("gc", "--keep-last", "1", "--delete").stdout
+    assert "removed: 1 x run forgotten (" in command("gc", "--keep-last", "1", "--delete").stdout
     assert store.runs(TINY) == ("0002",)
 
 

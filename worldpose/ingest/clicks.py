@@ -28,7 +28,7 @@ from worldpose.formats.annotations.marked_images import (
 from worldpose.formats.files import whole_file
 from worldpose.ingest.annotations import clicked_file, key_frames_file
 from worldpose.ingest.match_folder import read_spec
-from worldpose.ingest.pitch_file import pitch_file, read_pitch, refuse_unread_pitch
+from worldpose.ingest.pitch_file import pitch_file, read_pitch, require_free_pitch
 from worldpose.pitch.laws import prescribed_points
 from worldpose.pitch.template import PitchTemplate
 
@@ -81,7 +81,11 @@ class ImportedClicks:
 
 
 def import_clicks(
-    file: Path, folder: Path, owner: str | None = None, pitch: PitchSpec | None = None
+    file: Path,
+    folder: Path,
+    owner: str | None = None,
+    pitch: PitchSpec | None = None,
+    runs: Sequence[str] = (),
 ) -> ImportedClicks:
     """Write the labelled points of an annotation file into a match folder.
 
@@ -99,10 +103,12 @@ def import_clicks(
         owner: the static camera, or the broadcast view whose key frames are numbered by the images'
             names; None: the images are named after cameras.
         pitch: the match's pitch; None = the folder's or the standard one.
+        runs: MATCH/NUMBER of the runs that were computed with that pitch.
 
     Raises:
         InputError: the file has another form; a label is unknown; an image belongs to no camera, or
-            has another size; clicks exist already; or places depend on a venue's unknown pitch.
+            has another size; clicks exist already; places depend on a venue's unknown pitch; or
+            points are to be added to a pitch that has runs.
     """
     spec = read_spec(folder)
     is_unknown = pitch is None and spec.venue is not None and pitch_file(folder, spec) is None
@@ -141,7 +147,7 @@ def import_clicks(
         todo = "Give the project that has the venue (--project), or add pitch.json."
         raise InputError(str(file), f"the pitch of venue {spec.venue!r}", found, todo)
     if report.own_points:
-        refuse_unread_pitch(folder)
+        require_free_pitch(folder, runs)
         known = dict(pitch.points)
         known.update(report.own_points)
         records["pitch.json"] = pitch.model_copy(update={"points": known})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from data_contracts.cameras import CameraCalibration
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import ClockOffset, MatchSpec
+from data_contracts.usability import UsableLimits
 from worldpose.errors import InputError
 from worldpose.formats.files import require_file
 from worldpose.formats.keypoint_files import read_people, select_ranges
@@ -130,6 +131,32 @@ def read_unit(
     path = match.detections[unit_id]
     people = unit_frames(match.spec, unit_id).place(path, read_people(path).people)
     return people, match.calibrations.get(unit_id)
+
+
+def uncovered_clips(match: MatchFolder) -> Iterator[str]:
+    """Yield a warning for each clip whose 2D poses begin late, or end early, in all its cameras.
+
+    Shorter times without people are no reason for a reservation either (`UsableLimits`).
+    """
+    spec, seen = match.spec, dict[str, NDArray[np.int64]]()
+    for unit in match.detections:
+        people, _ = read_unit(match, unit)
+        seen[unit] = people.frame[np.isfinite(people.score).any(axis=1)]
+    for clip in spec.clips:
+        units = [*(camera.id for camera in spec.static_cameras), *spec.views_of(clip.id)]
+        if not {*units} <= seen.keys():
+            continue  # a detector finds the people of the others
+        first, last = clip.first_frame, clip.first_frame + clip.frame_count - 1
+        frame = np.concatenate([seen[unit] for unit in units])
+        frame = frame[(frame >= first) & (frame <= last)]
+        begin, end = (int(frame.min()), int(frame.max())) if len(frame) else (last + 1, last)
+        most = max(spec.fps, UsableLimits().max_absent_share * clip.frame_count)
+        if max(begin - first, last - end) > most:
+            where = f"only in frames {begin} to {end}" if len(frame) else "in no frame"
+            yield (
+                f"clip {clip.id}: it has frames {first} to {last}, and 2D poses {where}. Shorten "
+                "it in match.yaml (first_frame, frame_count), or give the 2D poses of the rest."
+            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -132,17 +132,25 @@ def _is_number(value: object) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def refuse_unread_pitch(folder: Path) -> None:
-    """Raise InputError if match.yaml names another pitch than pitch.json, or none.
+def require_free_pitch(folder: Path, runs: Sequence[str] = ()) -> None:
+    """Raise InputError if pitch.json must not be written.
 
     Raises:
-        InputError: nothing would read pitch.json.
+        InputError: match.yaml names another pitch, or none; or `runs` (MATCH/NUMBER) had its pitch.
     """
     file = folder / "match.yaml"
     content = read_yaml(file) if file.exists() else None
     named = content.get("pitch") if isinstance(content, dict) else None
     if named not in (None, "pitch.json"):
         raise _two_pitches(folder, str(named))
+    if runs:
+        raise InputError(
+            str(folder / "pitch.json"),
+            expected="no run yet: another pitch, or a point more on it, makes another match",
+            found=f"{', '.join(runs)}; nothing was written",
+            todo="Copy the folder, give the copy a new match_id in match.yaml, and import there; "
+            f"or forget the runs: worldpose gc --delete --forget {' --forget '.join(runs)}",
+        )
 
 
 def _two_pitches(folder: Path, named: str) -> InputError:

@@ -43,9 +43,7 @@ def register_match(match: MatchFolder, previous: Registration | None) -> Registr
             known = {
                 (file.path, file.size, file.modified_ns): file.sha256 for file in previous.files
             }
-        pitch = pitch_file(match.folder, match.spec)
-        roots = [*match.videos.values(), *match.detections.values(), *([pitch] if pitch else [])]
-        identifying = {path for root in roots for path in _files_under(match.folder, root)}
+        identifying = identifying_files(match)
         names = ("match.yaml", "calibration.toml", LENS_FILE, "annotations")
         roots = [*(match.folder / name for name in names), *match.stills.values()]
         roots += [*match.estimates.values(), *match.boxes.values(), *match.camera_data.values()]
@@ -69,6 +67,13 @@ def register_match(match: MatchFolder, previous: Registration | None) -> Registr
         return Registration(
             spec=match.spec, folder=folder, identity=identity.hexdigest(), files=files
         )
+
+
+def identifying_files(match: MatchFolder) -> set[str]:
+    """Return the files that make the match what it is: those of videos, detections and pitch."""
+    pitch = pitch_file(match.folder, match.spec)
+    roots = [*match.videos.values(), *match.detections.values(), *([pitch] if pitch else [])]
+    return {path for root in roots for path in _files_under(match.folder, root)}
 
 
 def digest_of_files(path: Path) -> str:

@@ -91,8 +91,8 @@ def format_scaled(value: float | None, scale: float, decimals: int) -> str:
 def _about(run: RunRecord) -> list[tuple[str, ...]]:
     return [
         ("started", f"{run.started_at:%Y-%m-%d %H:%M:%S %Z}".strip()),
-        ("took", f"{run.seconds:.1f} s"),
-        ("run before it", run.parent or "none"),
+        ("took, after the start of Prefect", f"{run.seconds:.1f} s"),
+        ("latest run that had ended before it", run.parent or "none"),
         (
             "units computed, reused, failed",
             f"{len(run.executed)}, {len(run.reused)}, {len(run.failed)}",

@@ -11,7 +11,7 @@ from data_contracts.run import Reservation, RunRecord
 from worldpose.errors import CorruptionError, InputError, StoreError
 from worldpose.store.blobs import Entry
 from worldpose.store.paths import MANIFEST, ResultId, is_name, record_path, reservation_path
-from worldpose.store.runs import list_pins, may_be_running, run_order
+from worldpose.store.runs import list_pins, may_be_running, run_files, run_order
 from worldpose.store.store import Store
 
 
@@ -110,7 +110,7 @@ def _describe_active(run: Reservation) -> str:
     return (
         f"Match {run.match_id} is skipped: run {run.run_id} (process {run.pid} on {run.host}), "
         f"started at {run.started_at:%Y-%m-%d %H:%M} UTC, may still be active. If it is dead, "
-        f"forget {run.match_id}/{run.run_id}."
+        f"forget it: worldpose gc --delete --forget {run.match_id}/{run.run_id}"
     )
 
 
@@ -163,16 +163,13 @@ def _check_arguments(store: Store, keep_last: int | None, forget: Collection[str
         )
     for name in forget:
         match_id, _, run_id = name.partition("/")
-        known = {
-            *store.runs(match_id),
-            *(open_run.run_id for open_run in store.unfinished_runs(match_id)),
-        }
-        if run_id not in known:
+        finished, reserved, _ = run_files(store.blobs, match_id)
+        if run_id not in (known := finished | reserved):
             raise InputError(
                 f"run to forget: {name}",
                 expected=f"match/run with one of the runs: {', '.join(sorted(known)) or '(none)'}",
                 found="no such run",
-                todo="List the runs with `worldpose status`.",
+                todo=f"List the runs: worldpose status {match_id}.",
             )
         if run_id in (pinned := _pin_names(store, match_id)):
             raise InputError(

@@ -312,7 +312,7 @@ class Store:
         wanted = wanted.zfill(4) if wanted.isdecimal() else wanted
         if wanted not in finished:
             pin = read_pin(self.blobs, match_id, run_id)
-            wanted = run_id if pin is None else pin.run_id
+            wanted = wanted if pin is None else pin.run_id
         record = None
         if wanted in finished:
             record = read_document(self.blobs, record_path(match_id, wanted), RunRecord)
@@ -320,8 +320,8 @@ class Store:
             raise InputError(
                 f"run {run_id} of match {match_id} in {self.url}",
                 expected=f"one of {', '.join(names)}" if names else "a finished run",
-                found="an unfinished run" if run_id in reserved else "no such run",
-                todo=f"Run: worldpose run {match_id}",
+                found="an unfinished run" if wanted in reserved else "no such run",
+                todo=f"List them: worldpose status {match_id}; or run: worldpose run {match_id}",
             )
         return record
 
