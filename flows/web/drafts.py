@@ -39,6 +39,7 @@ from flows.web.draft_problems import (
     DraftFile,
     Index,
     Problem,
+    camera_sizes,
     choose_name,
     describe_broken,
     form_problems,
@@ -158,9 +159,7 @@ class Drafts:
         try:
             content = (self._folder(draft_id) / "draft.json").read_bytes()
         except FileNotFoundError:
-            raise InputError(
-                "draft", "a match being created", "none: finished or discarded", "See the queue."
-            ) from None
+            raise _unknown("none: finished or discarded") from None
         return Draft.model_validate_json(content)
 
     def save(self, draft_id: str, content: dict[str, JsonValue], revision: int) -> bool:
@@ -326,7 +325,7 @@ class Drafts:
 
     def _folder(self, draft_id: str) -> Path:
         if not re.fullmatch(r"[0-9a-f]{16}", draft_id):
-            raise InputError("draft", "the id of a draft", "another text", "See the queue.")
+            raise _unknown("another text")
         return self._root / draft_id
 
     def _part(self, draft_id: str, file: DraftFile) -> Path:
@@ -394,7 +393,8 @@ class Drafts:
             problem = str(self._work(self._copy, draft_id, file) or "")
             return {**content, "state": "broken" if problem else "copying", "problem": problem}
         if not is_footage(file.name):
-            return {**content, "state": "ready"}
+            cameras = camera_sizes(self._whole(draft_id, file))
+            return {**content, "state": "ready", "cameras": cameras}
         index = self._index(draft_id, file)
         if index is None:
             return {**content, "state": "reading"}
@@ -491,3 +491,8 @@ class Drafts:
             found = build(self.store, draft.content, folder, indexes, draft.match_id)
             self._checked[draft.id] = (key, *found)
         return self._checked[draft.id][1:]
+
+
+def _unknown(found: str) -> InputError:
+    todo = "Open it from the list of matches."
+    return InputError("draft", "the id of a match that is being created", found, todo)

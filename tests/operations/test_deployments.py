@@ -248,6 +248,7 @@ def test_a_page_starts_a_match_by_its_deployment_and_says_what_it_waits_for(
     state = continuing.state("clicked")
     assert (state["state"], state["prefect"]) == ("running", first["prefect"])
     continuing.go_on("clicked-too")
+    assert continuing.running() == {"clicked": True, "clicked-too": True}
     assert "before it" in continuing.state("clicked-too")["lines"][0]
     (run,) = open_of(prefect, "clicked")
     prefect.queue.begin(run, run.flow_run)
@@ -256,10 +257,18 @@ def test_a_page_starts_a_match_by_its_deployment_and_says_what_it_waits_for(
     assert continuing.state("clicked")["percent"] == 0.0
     assert "once more" in continuing.go_on("clicked")["how"]
     assert len(open_of(prefect, "clicked")) == 2
-    assert continuing.cancel("clicked") and continuing.cancel("clicked-too")
+    assert continuing.running() == {"clicked": False, "clicked-too": True}
+    assert continuing.cancel("clicked", "Ada") and continuing.cancel("clicked-too", "Ada")
+    assert continuing.state("clicked-too") is None  # it had not begun
     (run,) = open_of(prefect, "clicked")  # the one at work: its worker ends it
     prefect.queue.change(run, "failed", "too dark")
     assert continuing.state("clicked")["lines"] == ["too dark"]
+    continuing.go_on("clicked")
+    (run,) = open_of(prefect, "clicked")
+    begun = prefect.queue.begin(run, run.flow_run)
+    prefect.queue.change(begun, "cancelled", "cancelled by Ada")
+    ended = continuing.state("clicked")
+    assert (ended["code"], ended["lines"]) == (130, ["Cancelled by Ada."])
 
 
 def test_the_worker_takes_installed_runs_with_parameters_of_their_own_alone(plan):
@@ -440,7 +449,7 @@ def test_the_worker_runs_what_is_due_and_ends_what_is_cancelled(plan, tmp_path, 
         wait_until(lambda: state(held) == "Running" and state(absent) == "Failed")
         pid = int(prefect.ask(f"/flow_runs/{held.flow_run}")["infrastructure_pid"])
         assert is_alive(pid) and prefect.queue.latest(held).pid == pid
-        prefect.cancel(prefect.queue.latest(held), "")
+        prefect.cancel(prefect.queue.latest(held), "cancelled by Ada")
         wait_until(lambda: state(held) == "Cancelled")
     at_work.join(60)
     assert not at_work.is_alive() and not is_alive(pid)
@@ -451,6 +460,7 @@ def test_the_worker_runs_what_is_due_and_ends_what_is_cancelled(plan, tmp_path, 
         "held": "cancelled",
     }
     assert "absent" in ended["absent"].message
+    assert ended["held"].message == "cancelled by Ada"
 
 
 @pytest.mark.slow  # a worker twice, and the processes of a run
