@@ -104,7 +104,7 @@ async function showNewRun() {
   seen.names = sent;
   seen.crops = [...new Set(crops)];
   // Nobody is seen before the first frame; two people are joined without Shift.
-  await page.click('[data-person="7"]');
+  await page.click('[data-person="7"] .bar', { position: { x: 1, y: 4 } });
   seen.split = [await page.locator("[data-split]").innerText(), await page.locator("[data-tracks] button >> text=Split").isDisabled()];
   await page.click("button >> text=Join two");
   await page.click('[data-person="8"]');
@@ -199,7 +199,7 @@ async function click() {
 // An image that the server refuses, and a camera that is given.
 async function refuse() {
   await at_server("picture/final/north", (path) => (path === "/api/session" ? session : { given: true, has_picture: false, size: [1920, 1080], markings: { line: [[[0, 0], [900, 900]]] } }));
-  seen.given = await page.locator("[data-given] canvas").first().isVisible();
+  seen.given = await page.waitForSelector("[data-given] canvas").then(() => true, () => false);
   await at_server("picture/final/north", (path) => {
     if (path === "/api/session") return session;
     return path.endsWith("/image") ? [422, { error: "north.png: expected a PNG image, found damaged bytes" }] : { has_picture: true };

@@ -52,6 +52,10 @@ def test_keys_move_through_time_colours_and_cameras(seen):
     assert seen["played"] > 20
 
 
+def test_no_name_is_written_over_a_nearer_one(seen):
+    assert seen["labels"] == [20, 1, 2]
+
+
 def test_the_video_shows_the_frame_of_the_view(seen):
     # Frame 20 of the clip is the 6th of the video, shown from 0.20 to 0.24 s.
     assert 0.2 < seen["video"] < 0.24
