@@ -105,12 +105,7 @@ class StatusRow:
             return "waiting for its turn" if self.at_work.get("waits") else "running"
         if self.match.problem:
             return "cannot be opened"
-        return say_cancelled(self.match, self.at_work).words or self.match.state
-
-    @property
-    def why(self) -> str:
-        """The reason of the state, as the page of the match has it."""
-        return say_cancelled(self.match, self.at_work).why
+        return self.match.words or self.match.state
 
     @property
     def kind(self) -> str:
@@ -145,7 +140,8 @@ def _rows(context: PageContext, found: Sequence[MatchSummary], page: int) -> lis
     for match in found[PAGE * (page - 1) : PAGE * page]:
         name = match.match_id
         whole = match if match.is_unseen else context.overview.read(name)
-        rows.append(StatusRow(whole, context.continuing.state(name), links.get(name, "")))
+        at_work = context.continuing.state(name)
+        rows.append(StatusRow(say_cancelled(whole, at_work), at_work, links.get(name, "")))
     return rows
 
 
@@ -221,12 +217,11 @@ TEMPLATE: Final = _read_page()
 
 def _as_json(row: StatusRow) -> dict[str, Any]:
     match, latest = row.match, row.match.latest
-    about = {"problem", "stages"}
+    about = {"problem", "why", "stages"}
     return {
         "match": match.match_id,
         "state": match.state,
         "now": row.words,
-        "why": row.why,
         "run": latest and latest.run_id,
         "seconds": latest and latest.seconds,
         "at_work": row.at_work,

@@ -129,8 +129,6 @@ STORE_SECRETS = (CLIENT_LOGIN, CLOUD_LOGIN, "AWS_*", "OPENLINEAGE_*")
 """Variables that a run which the pages start gets although they hold secrets: it uses them."""
 LAST_LINES = 12
 """Lines of a run's output that a page shows."""
-CANCELLED = 130
-"""Exit code of a cancelled run."""
 PATIENCE_SECONDS = 15.0
 """Time in which a cancelled run ends by itself [s]."""
 FRESH_SECONDS = 2.0
@@ -255,7 +253,7 @@ class Continuing:
         if _ran_since(self.store, match_id, last.changed_at):
             return None
         if last.state == "cancelled":
-            code, message = CANCELLED, f"{message[:1].upper()}{message[1:]}."
+            code, message = 130, f"{message[:1].upper()}{message[1:]}."
         record = latest_run(self.store, match_id)
         if record is not None and f"run {record.run_id} of {match_id}:" in message:
             # The flow failed because its run is not complete: the record says how it ended.
@@ -290,7 +288,8 @@ class Continuing:
             runs = served.queue.runs("queue/match")
             running = [run for run in runs if run.state not in ENDED]
             off = [run for run in runs if run.state == "cancelled" and run.pid]  # had begun
-            ended = {run.match_id: run for run in sorted((*last_ended(runs), *off), key=_end_of)}
+            last = sorted((*last_ended(runs), *off), key=lambda run: run.changed_at)
+            ended = {run.match_id: run for run in last}
             seen = self._seen = _Seen(time.monotonic(), served, running, ended)
         return seen
 
@@ -340,13 +339,9 @@ def _ran_since(store: Store, match_id: str, ended_at: datetime) -> bool:
     return is_begun or (record is not None and record.finished_at > ended_at)
 
 
-def _end_of(run: QueuedRun) -> datetime:
-    return run.changed_at
-
-
 def say_cancelled(found: MatchSummary, at_work: Mapping[str, Any] | None) -> MatchSummary:
     """Return a summary; that of a match whose run a person cancelled says so, and by whom."""
-    if found.kind != "stopped" or at_work is None or at_work.get("code") != CANCELLED:
+    if found.kind != "stopped" or at_work is None or at_work.get("code") != 130:
         return found
     why = f"{at_work['lines'][-1]} Its finished steps are kept."
     return found.model_copy(update={"words": "cancelled", "why": why})
@@ -442,10 +437,7 @@ class LocalRuns:
                 self._at_work = match_id
 
     def _run(self, match_id: str, gates: str | None) -> tuple[int, Path | str]:
-        """Run a match in its own process; return its exit code, and the file of its output.
-
-        Of a cancelled one, the text says who did it.
-        """
+        """Run a match; return its exit code, and its output's file, or who cancelled it."""
         said = Path(tempfile.mkdtemp(prefix="worldpose-run-")) / "output.txt"
         said.touch()
         with self._lock:
@@ -467,5 +459,5 @@ class LocalRuns:
         code = process.wait()
         # Before the command handles it, the signal of `cancel` ends the process or Python's start.
         if code != 0 and self._cancelled_by:
-            return CANCELLED, f"Cancelled on the page of the match by {self._cancelled_by}."
+            return 130, f"Cancelled on the page of the match by {self._cancelled_by}."
         return code, said

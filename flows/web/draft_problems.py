@@ -132,11 +132,10 @@ def still_size(path: Path) -> tuple[int, int]:
 
 def camera_sizes(file: Path) -> dict[str, tuple[int, int]]:
     """Return width and height [px] of each camera of a calibration.toml; of none in other files."""
-    if file.name != "calibration.toml":
-        return {}
     with suppress(InputError):  # the check of the match folder says what is wrong with it
-        cameras = read_calibration(file, {}, LeftOut(), any_unit=True)
-        return {name: camera.image_size for name, camera in cameras.items()}
+        if file.name == "calibration.toml":
+            cameras = read_calibration(file, {}, LeftOut(), any_unit=True)
+            return {name: camera.image_size for name, camera in cameras.items()}
     return {}
 
 

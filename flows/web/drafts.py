@@ -159,7 +159,9 @@ class Drafts:
         try:
             content = (self._folder(draft_id) / "draft.json").read_bytes()
         except FileNotFoundError:
-            raise _unknown("none: finished or discarded") from None
+            raise InputError(
+                "draft", "a match being created", "none: finished or discarded", "See the matches."
+            ) from None
         return Draft.model_validate_json(content)
 
     def save(self, draft_id: str, content: dict[str, JsonValue], revision: int) -> bool:
@@ -325,7 +327,7 @@ class Drafts:
 
     def _folder(self, draft_id: str) -> Path:
         if not re.fullmatch(r"[0-9a-f]{16}", draft_id):
-            raise _unknown("another text")
+            raise InputError("draft", "a match being created", "another text", "See the matches.")
         return self._root / draft_id
 
     def _part(self, draft_id: str, file: DraftFile) -> Path:
@@ -393,8 +395,8 @@ class Drafts:
             problem = str(self._work(self._copy, draft_id, file) or "")
             return {**content, "state": "broken" if problem else "copying", "problem": problem}
         if not is_footage(file.name):
-            cameras = camera_sizes(self._whole(draft_id, file))
-            return {**content, "state": "ready", "cameras": cameras}
+            sizes = camera_sizes(self._whole(draft_id, file))
+            return {**content, "state": "ready", "cameras": sizes}
         index = self._index(draft_id, file)
         if index is None:
             return {**content, "state": "reading"}
@@ -491,8 +493,3 @@ class Drafts:
             found = build(self.store, draft.content, folder, indexes, draft.match_id)
             self._checked[draft.id] = (key, *found)
         return self._checked[draft.id][1:]
-
-
-def _unknown(found: str) -> InputError:
-    todo = "Open it from the list of matches."
-    return InputError("draft", "the id of a match that is being created", found, todo)

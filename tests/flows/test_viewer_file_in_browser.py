@@ -50,9 +50,6 @@ def test_keys_move_through_time_colours_and_cameras(seen):
     assert ((seen["last"], seen["stepped"]), seen["colours"]) == ((59, 1), "spread")
     assert seen["through"] == "broadcast"
     assert seen["played"] > 20
-
-
-def test_no_name_is_written_over_a_nearer_one(seen):
     assert seen["labels"] == [20, 1, 2]
 
 

@@ -42,8 +42,7 @@ export class Labels {
     const kept = [];
     const depth = ([[x, y, z]]) => M[3] * x + M[7] * y + M[11] * z + M[15];
     return found.toSorted((a, b) => depth(a) - depth(b)).flatMap(([place, text, color]) => {
-      const at = project(M, place, width, height);
-      const box = this.boxes.get(text);
+      const [at, box] = [project(M, place, width, height), this.boxes.get(text)];
       if (!at || kept.some(([x, y, wide]) => 2 * Math.abs(at[0] - x) < wide + box[2] && Math.abs(at[1] - y) < box[3])) return [];
       kept.push([...at, box[2]]);
       return [...place, ...box, ...color];
