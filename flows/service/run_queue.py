@@ -122,8 +122,8 @@ def _describe(reporter: Reporter | None) -> tuple[float, str, int]:
     if reporter is None or not reporter.stage:
         return 0.0, "", 0
     at, left = reporter.run_progress, max(reporter.left, 0)
-    units = f", {left} {'result' if left == 1 else 'results'} left" if left else ""
+    units = f", {left} {'result' if left == 1 else 'results'} of this step left" if left else ""
     doing = f"{reporter.stage}{units}"
     if at.seconds_left is not None:
-        doing += f", about {format_duration(at.seconds_left)}"
+        doing += f", about {format_duration(at.seconds_left)} to the end of the run"
     return min(max(at.share, 0.0), 1.0), doing, left

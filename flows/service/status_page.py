@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -22,7 +22,7 @@ from flows.review.descriptions import when
 from flows.review.metric_words import in_short, reason_words
 from flows.service.alerts import kept_alerts
 from flows.service.layout import served_state
-from flows.web.app_context import PageContext
+from flows.web.app_context import PageContext, say_cancelled
 from flows.web.browser_words import in_browser
 
 WORST_FIRST: Final = ("failed", "waiting", "blocked", "done")
@@ -102,7 +102,7 @@ class StatusRow:
     def words(self) -> str:
         """The state in words, as the page of the match has it."""
         if self.at_work is not None and self.at_work["state"] == "running":
-            return "running"
+            return "waiting for its turn" if self.at_work.get("waits") else "running"
         if self.match.problem:
             return "cannot be opened"
         return self.match.words or self.match.state
@@ -124,8 +124,9 @@ class StatusRow:
         return list(units_of(self.match))
 
 
-def _running(match: MatchSummary, running: Container[str]) -> Mapping[str, Any] | None:
-    return {"state": "running"} if match.match_id in running else None
+def _running(match: MatchSummary, running: Mapping[str, bool]) -> Mapping[str, Any] | None:
+    waits = running.get(match.match_id)
+    return None if waits is None else {"state": "running", "waits": waits}
 
 
 def _pages(found: Sequence[MatchSummary]) -> int:
@@ -139,7 +140,8 @@ def _rows(context: PageContext, found: Sequence[MatchSummary], page: int) -> lis
     for match in found[PAGE * (page - 1) : PAGE * page]:
         name = match.match_id
         whole = match if match.is_unseen else context.overview.read(name)
-        rows.append(StatusRow(whole, context.continuing.state(name), links.get(name, "")))
+        at_work = context.continuing.state(name)
+        rows.append(StatusRow(say_cancelled(whole, at_work), at_work, links.get(name, "")))
     return rows
 
 

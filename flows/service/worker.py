@@ -150,9 +150,10 @@ class ServedWorker(BaseWorker[_OwnJob, BaseVariables, BaseWorkerResult]):
         while True:
             with anyio.move_on_after(CANCEL_SECONDS):
                 await process.wait()
-            code, kind = process.returncode, None
+            code, kind, why = process.returncode, None, "cancelled at Prefect"
             try:
-                kind = (await self.client.read_flow_run(flow_run.id)).state_type
+                if there := (await self.client.read_flow_run(flow_run.id)).state:
+                    kind, why = there.type, there.message or why
             except Exception as error:  # the server is gone, or the run was deleted: it goes on
                 LOG.debug("run %r: %s", flow_run.name, error)
             run = await to_thread.run_sync(queue.latest, first)
@@ -164,7 +165,7 @@ class ServedWorker(BaseWorker[_OwnJob, BaseVariables, BaseWorkerResult]):
                 code, kind = 0, StateType.CANCELLED
             if code is not None and is_open:
                 if kind == StateType.CANCELLED:
-                    await to_thread.run_sync(queue.change, run, "cancelled", "cancelled at Prefect")
+                    await to_thread.run_sync(queue.change, run, "cancelled", why)
                 else:
                     why = f"its process ended with code {code}"
                     with suppress(Exception):  # without a server, the queue alone knows it

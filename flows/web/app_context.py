@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,7 +19,7 @@ from typing import Annotated, Any
 from fastapi import Depends, HTTPException, Request
 
 from data_contracts.match import Registration
-from data_contracts.operations import QueuedRun
+from data_contracts.operations import MatchSummary, QueuedRun
 from data_contracts.review import ReviewRequest
 from data_contracts.run import EXIT_CODES
 from data_contracts.static_calibration import ClickedMarkings
@@ -198,7 +199,7 @@ class Continuing:
         resumed = resume(self.store, match)
         return {"state": "resumed", "how": f"resumed {', '.join(resumed)}"} if resumed else None
 
-    def cancel(self, match_id: str) -> bool:
+    def cancel(self, match_id: str, who: str) -> bool:
         """End the match's run, or take it out of the queue; its finished results are kept.
 
         Returns:
@@ -210,15 +211,15 @@ class Continuing:
         with self._lock:
             served = match_runs_of(self.store.url)
             if served is None:
-                return self._local.cancel(match_id)
+                return self._local.cancel(match_id, who)
             self._seen = None
             own = _open_runs(served, match_id)
             for run in own:
-                served.cancel(run, "cancelled on the page of the match")
+                served.cancel(run, f"cancelled on the page of the match by {who}")
             return bool(own)
 
     def state(self, match_id: str) -> dict[str, Any] | None:
-        """Return the state of the match's run, or of the last one if that failed; else None."""
+        """Return the state of the match's run, or of the last one if it failed or was cancelled."""
         seen = self._look()
         if seen is None:
             return self._local.state(match_id)
@@ -246,11 +247,13 @@ class Continuing:
                 "stage": stage[0] if stage else "",
             }
         last = seen.ended.get(match_id)
-        if last is None or last.state != "failed":
+        if last is None or last.state == "complete":
             return None
         code, message = 1, last.message
         if _ran_since(self.store, match_id, last.changed_at):
             return None
+        if last.state == "cancelled":
+            code, message = 130, f"{message[:1].upper()}{message[1:]}."
         record = latest_run(self.store, match_id)
         if record is not None and f"run {record.run_id} of {match_id}:" in message:
             # The flow failed because its run is not complete: the record says how it ended.
@@ -258,12 +261,14 @@ class Continuing:
         link = seen.served.link(last)
         return {"state": "ended", "code": code, "lines": [message], "prefect": link}
 
-    def running(self) -> set[str]:
-        """Return the matches with a run at work, or one that waits for its turn."""
+    def running(self) -> dict[str, bool]:
+        """Return the matches with a run, each with whether that waits for its turn."""
         seen = self._look()
         if seen is None:
             return self._local.running()
-        return {run.match_id for run in seen.open if run.state != "waiting"}
+        begun = {run.match_id for run in seen.open if run.state == "begun"}
+        own = (run.match_id for run in seen.open if run.state != "waiting")
+        return {name: name not in begun for name in own}
 
     def links(self) -> dict[str, str]:
         """Return the page of each match's latest run at Prefect; empty without a service."""
@@ -282,7 +287,9 @@ class Continuing:
         if seen is None or time.monotonic() - seen.at > FRESH_SECONDS:
             runs = served.queue.runs("queue/match")
             running = [run for run in runs if run.state not in ENDED]
-            ended = {run.match_id: run for run in last_ended(runs)}
+            off = [run for run in runs if run.state == "cancelled" and run.pid]  # had begun
+            last = sorted((*last_ended(runs), *off), key=lambda run: run.changed_at)
+            ended = {run.match_id: run for run in last}
             seen = self._seen = _Seen(time.monotonic(), served, running, ended)
         return seen
 
@@ -308,7 +315,7 @@ def read_progress(said: str) -> dict[str, Any]:
         return {"lines": doing, "percent": 0.0, "stage": stage}
     percent, left = float(units[-1][1]), units[-1][2].strip()
     if doing and left:
-        doing = [f"{doing[0]}, {left} left"]
+        doing = [f"{doing[0]}, {left} left of the run"]
     return {"lines": doing, "percent": percent, "stage": stage}
 
 
@@ -326,9 +333,18 @@ class _Seen:
 
 
 def _ran_since(store: Store, match_id: str, ended_at: datetime) -> bool:
-    """Return whether a run of the match, of these pages or not, has a record since then."""
+    """Return whether a run of the match, of these pages or not, has a record or begun since."""
     record = latest_run(store, match_id)
-    return record is not None and record.finished_at > ended_at
+    is_begun = any(run.started_at > ended_at for run in store.unfinished_runs(match_id))
+    return is_begun or (record is not None and record.finished_at > ended_at)
+
+
+def say_cancelled(found: MatchSummary, at_work: Mapping[str, Any] | None) -> MatchSummary:
+    """Return a summary; that of a match whose run a person cancelled says so, and by whom."""
+    if found.kind != "stopped" or at_work is None or at_work.get("code") != 130:
+        return found
+    why = f"{at_work['lines'][-1]} Its finished steps are kept."
+    return found.model_copy(update={"words": "cancelled", "why": why})
 
 
 def _terminate(process: subprocess.Popen[bytes]) -> None:
@@ -345,7 +361,7 @@ class LocalRuns:
     _at_work: str | None = None
     _output: Path | None = None
     _process: subprocess.Popen[bytes] | None = None
-    _is_cancelled: bool = False
+    _cancelled_by: str = ""
     _ended: dict[str, tuple[int, Path | str, datetime]] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
 
@@ -383,19 +399,20 @@ class LocalRuns:
         lines = printed.splitlines()[-LAST_LINES:]
         return {"state": "ended", "code": code, "lines": lines}
 
-    def running(self) -> set[str]:
-        """Return the match at work and those that wait for their turn."""
+    def running(self) -> dict[str, bool]:
+        """Return the match at work and those that wait for their turn, and whether each waits."""
         with self._lock:
-            return {name for name in (self._at_work, *dict(self._waiting)) if name is not None}
+            at_work = {} if self._at_work is None else {self._at_work: False}
+            return {**{name: True for name, _ in self._waiting}, **at_work}
 
-    def cancel(self, match_id: str) -> bool:
+    def cancel(self, match_id: str, who: str) -> bool:
         """End the match's run as Ctrl-C does, or take it out of the queue; return whether."""
         with self._lock:
             waits = match_id in dict(self._waiting)
             self._waiting = [each for each in self._waiting if each[0] != match_id]
             is_at_work = match_id == self._at_work and self._process is not None
             if is_at_work and self._process is not None:
-                self._is_cancelled = True
+                self._cancelled_by = who
                 os.killpg(self._process.pid, signal.SIGINT)
                 # Some ignore it, as what is started in the background of a script.
                 later = Timer(PATIENCE_SECONDS, _terminate, [self._process])
@@ -419,8 +436,8 @@ class LocalRuns:
                 match_id, gates = self._waiting.pop(0)
                 self._at_work = match_id
 
-    def _run(self, match_id: str, gates: str | None) -> tuple[int, Path]:
-        """Run a match in its own process; return its exit code, and the file of its output."""
+    def _run(self, match_id: str, gates: str | None) -> tuple[int, Path | str]:
+        """Run a match; return its exit code, and its output's file, or who cancelled it."""
         said = Path(tempfile.mkdtemp(prefix="worldpose-run-")) / "output.txt"
         said.touch()
         with self._lock:
@@ -438,7 +455,9 @@ class LocalRuns:
                 env=without_secrets(os.environ, keep=STORE_SECRETS),
             )
         with self._lock:
-            self._process, self._is_cancelled = process, False
+            self._process, self._cancelled_by = process, ""
         code = process.wait()
         # Before the command handles it, the signal of `cancel` ends the process or Python's start.
-        return 130 if code != 0 and self._is_cancelled else code, said
+        if code != 0 and self._cancelled_by:
+            return 130, f"Cancelled on the page of the match by {self._cancelled_by}."
+        return code, said

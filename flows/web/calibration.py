@@ -28,6 +28,7 @@ from flows.web.app_context import PageContext
 from flows.web.browser_words import describe_error
 from flows.web.images import encode_image, file_mark
 from worldpose.errors import InputError, WorldposeError
+from worldpose.geometry.cameras import Camera
 from worldpose.ingest.footage import read_still, unit_frames
 from worldpose.pitch.template import PitchTemplate
 from worldpose.review.evidence import PitchDrawing, Preview, preview
@@ -126,7 +127,11 @@ def routes(context: PageContext) -> APIRouter:
     @router.get("")
     def picture(match_id: str, owner: str, frame: int | None = None) -> dict[str, Any]:
         match, drawing, size = open_picture(match_id, owner)
-        return {"size": size, "pitch": _pitch(drawing), **_describe(context, match, owner, frame)}
+        given, markings = match.folder.calibrations.get(owner), {}
+        if given is not None:
+            markings = _round_pieces(drawing.project_markings(Camera.from_calibration(given)))
+        seen = {"size": size, "pitch": _pitch(drawing), "markings": markings}
+        return {**seen, **_describe(context, match, owner, frame)}
 
     @router.get("/image")
     def image(match_id: str, owner: str, frame: int | None = None) -> Response:

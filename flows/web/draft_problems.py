@@ -130,6 +130,15 @@ def still_size(path: Path) -> tuple[int, int]:
     return size
 
 
+def camera_sizes(file: Path) -> dict[str, tuple[int, int]]:
+    """Return width and height [px] of each camera of a calibration.toml; of none in other files."""
+    with suppress(InputError):  # the check of the match folder says what is wrong with it
+        if file.name == "calibration.toml":
+            cameras = read_calibration(file, {}, LeftOut(), any_unit=True)
+            return {name: camera.image_size for name, camera in cameras.items()}
+    return {}
+
+
 def form_problems(
     content: Mapping[str, JsonValue], files: Sequence[Mapping[str, Any]]
 ) -> list[Problem]:

@@ -39,6 +39,7 @@ from flows.web.draft_problems import (
     DraftFile,
     Index,
     Problem,
+    camera_sizes,
     choose_name,
     describe_broken,
     form_problems,
@@ -159,7 +160,7 @@ class Drafts:
             content = (self._folder(draft_id) / "draft.json").read_bytes()
         except FileNotFoundError:
             raise InputError(
-                "draft", "a match being created", "none: finished or discarded", "See the queue."
+                "draft", "a match being created", "none: finished or discarded", "See the matches."
             ) from None
         return Draft.model_validate_json(content)
 
@@ -326,7 +327,7 @@ class Drafts:
 
     def _folder(self, draft_id: str) -> Path:
         if not re.fullmatch(r"[0-9a-f]{16}", draft_id):
-            raise InputError("draft", "the id of a draft", "another text", "See the queue.")
+            raise InputError("draft", "a match being created", "another text", "See the matches.")
         return self._root / draft_id
 
     def _part(self, draft_id: str, file: DraftFile) -> Path:
@@ -394,7 +395,8 @@ class Drafts:
             problem = str(self._work(self._copy, draft_id, file) or "")
             return {**content, "state": "broken" if problem else "copying", "problem": problem}
         if not is_footage(file.name):
-            return {**content, "state": "ready"}
+            sizes = camera_sizes(self._whole(draft_id, file))
+            return {**content, "state": "ready", "cameras": sizes}
         index = self._index(draft_id, file)
         if index is None:
             return {**content, "state": "reading"}

@@ -93,9 +93,9 @@ def _add_changes(router: APIRouter, context: PageContext) -> None:
     """Add the routes that cancel a run, and keep one by a name."""
 
     @router.post("/cancellation")
-    def cancel(match_id: str) -> dict[str, bool]:
+    def cancel(match_id: str, who: Person) -> dict[str, bool]:
         context.registration(match_id)  # its disk may not answer
-        if not context.continuing.cancel(match_id):
+        if not context.continuing.cancel(match_id, who):
             raise HTTPException(409, "no run of these pages is at work: end it where it was begun")
         return {"cancelled": True}
 

@@ -20,7 +20,7 @@ from flows.review.verdicts import Review, reviews_of
 from flows.run_record import latest_run
 from flows.service.layout import served_state
 from flows.stage import Match
-from flows.web.app_context import PageContext
+from flows.web.app_context import PageContext, say_cancelled
 from flows.web.browser_words import in_browser
 from flows.web.calibration import key_frames
 from flows.web.corrections import describe_groups
@@ -144,7 +144,8 @@ def describe_review(review: Review) -> dict[str, Any]:
 
 def _glance(context: PageContext, found: MatchSummary) -> dict[str, Any]:
     """Return a summary as JSON; while a run of these pages is at work, they show its progress."""
-    latest = found.latest
+    at_work = _local_run(context, found.match_id)
+    found, latest = say_cancelled(found, at_work), found.latest
     elsewhere = {"state": "elsewhere", "lines": [found.open_run]} if found.open_run else None
     return {
         "match": found.match_id,
@@ -178,7 +179,7 @@ def _glance(context: PageContext, found: MatchSummary) -> dict[str, Any]:
             "seconds": found.seconds,
             "units": {kind: len(names) for kind, names in found.units.items()},
         },
-        "at_work": _local_run(context, found.match_id) or elsewhere,
+        "at_work": at_work or elsewhere,
     }
 
 

@@ -103,6 +103,12 @@ await page.locator("select[data-still]").first().selectOption("stills/first.png"
 await page.setInputFiles("[data-upload]", task.clicks);
 await page.waitForSelector('[data-notes] >> text="second_keypoints.xml: 1 clicks in second"');
 await page.click("text=Paste a list");
+seen.losing = [];
+for (const list of ["kane, Harry Kane\nkane, Bob", "junk"]) {
+  await page.fill("[data-paste]", list);
+  await page.click("text=Add these people");
+  seen.losing.push(await page.locator("section >> [role=alert].wrong").innerText());
+}
 await page.fill("[data-paste]", "ID;Name;Team;Role\nkane; Harry Kane; England\npickford\tPickford, Jordan\tEngland\tGK");
 await page.click("text=Add these people");
 await page.waitForSelector("[data-person='1']");

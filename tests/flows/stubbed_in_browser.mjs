@@ -51,7 +51,7 @@ const trackOf = (id, name) => ({ id, name, seen: { north: 1 }, segments: [[100, 
 // A new run while the page is open; two names at once; two downloads at once.
 async function showNewRun() {
   let [run, slow] = ["0001", 0];
-  const [asked, names, sent, written, crops] = [[], {}, [], [], []];
+  const [asked, names, sent, written, crops, merged] = [[], {}, [], [], [], []];
   await at_server("match/final", async (path, search, body) => {
     if (path.includes("/scenes/")) asked.push(search);
     if (path.includes("/scenes/")) return [500, { error: "stub" }];
@@ -65,7 +65,8 @@ async function showNewRun() {
     if (path.endsWith("/runs")) return [];
     if (path.endsWith("/corrections")) {
       const { edit } = body.edits[0];
-      sent.push(edit.name);
+      if (edit.kind === "merged_tracks") merged.push(edit.kept, edit.merged);
+      else sent.push(edit.name);
       names[edit.person] = edit.name;
     }
     if (path.endsWith("/crop")) crops.push(new URLSearchParams(search).get("run_id"));
@@ -102,6 +103,14 @@ async function showNewRun() {
   await wait(4);
   seen.names = sent;
   seen.crops = [...new Set(crops)];
+  // Nobody is seen before the first frame; two people are joined without Shift.
+  await page.click('[data-person="7"] .bar', { position: { x: 1, y: 4 } });
+  seen.split = [await page.locator("[data-split]").innerText(), await page.locator("[data-tracks] button >> text=Split").isDisabled()];
+  await page.click("button >> text=Join two");
+  await page.click('[data-person="8"]');
+  await page.click("button >> text=Join two");
+  await wait(2);
+  seen.pair = merged;
 }
 
 const held = async (key, count) => {
@@ -187,8 +196,10 @@ async function click() {
   seen.kept = kept.length;
 }
 
-// An image that the server refuses.
+// An image that the server refuses, and a camera that is given.
 async function refuse() {
+  await at_server("picture/final/north", (path) => (path === "/api/session" ? session : { given: true, has_picture: false, size: [1920, 1080], markings: { line: [[[0, 0], [900, 900]]] } }));
+  seen.given = await page.waitForSelector("[data-given] canvas").then(() => true, () => false);
   await at_server("picture/final/north", (path) => {
     if (path === "/api/session") return session;
     return path.endsWith("/image") ? [422, { error: "north.png: expected a PNG image, found damaged bytes" }] : { has_picture: true };

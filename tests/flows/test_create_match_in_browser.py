@@ -97,6 +97,10 @@ def test_a_match_is_created_through_a_restart_and_a_reload(tmp_path):
     assert seen["refused"] == 0
     assert seen["name"] == "cup_final"  # a blank of a name is written as ids have it
     assert seen["close"].endswith("/8?fps=25&width=4096")
+    assert [text.split(":")[0] for text in seen["losing"]] == [
+        'Line 2, "kane, Bob"',
+        'Line 1, "junk"',
+    ]
     assert seen["pasted"] == ["2 added, 0 changed", "0 added, 1 changed"]
     assert (seen["again"], seen["offset"]) == (["cup_other", "25"], "second offset 4 frames")
     assert (seen["together"], seen["unsaved"]) == (["10", "16"], [False, False])

@@ -422,14 +422,18 @@ def test_names_from_a_browser_are_safe_paths_and_what_no_match_needs_is_refused(
     ada = open_pages(place)
     draft = ada.post(DRAFTS, json={}).json()["id"]
     for name in NAMES:
-        new = {"name": name, "size": 3, "modified_ms": 0}
+        new = {"name": name, "size": len(CALIBRATION), "modified_ms": 0}
         assert ada.post(f"{DRAFTS}/{draft}/files", json=new).status_code == 200
     files = ada.get(f"{DRAFTS}/{draft}").json()["files"]
     assert [file["name"] for file in files] == [*NAMES.values()]
+    put(ada, draft, files[-1]["id"], 0, CALIBRATION)
+    cameras = ada.get(f"{DRAFTS}/{draft}").json()["files"][-1]["cameras"]
+    assert cameras == {"near_left": [192, 128]}  # the page proposes them
     sizes = [("a.mp4", 0), ("a.mp4", 1 << 52), ("a.mp4", -1), ("match.yaml", 3), ("run.sh", 3)]
     for name, size in sizes:
         new = {"name": name, "size": size}
         assert ada.post(f"{DRAFTS}/{draft}/files", json=new).status_code == 422
+    assert "queue" not in ada.get(f"{DRAFTS}/zzz").text  # no page is called so
     for other in ("..", "%2e%2e", "0123456789abcdef", "x" * 16):
         assert ada.get(f"{DRAFTS}/{other}").status_code in (404, 422)
         assert ada.post(f"{DRAFTS}/{other}/removal", json={}).status_code in (404, 405, 422)

@@ -17,6 +17,7 @@ from flows.review import corrections
 from flows.web import app_context
 from flows.web.corrections import SESSION_GAP
 from worldpose.errors import StoreError
+from worldpose.formats.calibration_forms import read_calibration
 from worldpose.review.journal import read_journal
 from worldpose.store.store import Store
 
@@ -133,7 +134,7 @@ def test_a_match_that_nobody_clicked_is_clicked_from_nothing(
     assert expected()["cam01"] == {}
 
 
-def test_a_page_shows_the_pitch_as_it_was_corrected(ada, project_copy, monkeypatch):
+def test_a_page_shows_the_pitch_as_it_was_corrected(ada, project_copy, tiny, monkeypatch):
     store, path = Store.open(str(project_copy)), f"{MATCH}/pictures/cam00"
     opened = open_match(store, TINY)
     for length in (105.0, 101.0):
@@ -141,6 +142,10 @@ def test_a_page_shows_the_pitch_as_it_was_corrected(ada, project_copy, monkeypat
         match = replace(opened, folder=replace(opened.folder, pitch=pitch))
         monkeypatch.setattr(app_context, "open_for_review", lambda *_, match=match: match)
         assert ada.get(path).json()["pitch"]["length"] == length
+    camera = next(iter(read_calibration(tiny / "reference" / "calibration.toml").values()))
+    match = replace(match, folder=replace(match.folder, calibrations={"cam00": camera}))
+    monkeypatch.setattr(app_context, "open_for_review", lambda *_: match)
+    assert ada.get(path).json()["markings"]
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from command_line import TINY
 from page_client import MATCH
 
 from data_contracts.conventions import COCO17
+from data_contracts.operations import MatchSummary
 from data_contracts.review import Correction, MovedKeypoint, Withdrawal
 from flows import registering
 from flows.match_state import corrections_since
@@ -87,7 +88,12 @@ def test_a_run_is_cancelled(ada, monkeypatch):
     while (ada.get(MATCH).json()["at_work"] or {}).get("state") == "running":
         assert time.monotonic() - begun < 40
         time.sleep(0.2)
-    assert ada.get(MATCH).json()["at_work"]["code"] == 130  # as the command itself ends
+    ended = ada.get(MATCH).json()["at_work"]
+    assert ended["code"] == 130  # as the command itself ends
+    stopped = MatchSummary(match_id="m", kind="stopped", words="stopped before its end")
+    said = app_context.say_cancelled(stopped, ended)
+    assert (said.words, "by Ada. Its finished steps" in said.why) == ("cancelled", True)
+    assert app_context.say_cancelled(stopped, {**ended, "code": 1}) == stopped
     killed = [sys.executable, "-c", begin + "os.kill(os.getpid(), 2); time.sleep(9)"]
     monkeypatch.setattr(app_context, "_COMMAND", killed)
     ada.post(f"{MATCH}/runs", json={}).raise_for_status()

@@ -158,6 +158,8 @@ def test_pages_lose_and_repeat_nothing_at_a_slow_or_refusing_server(tmp_path):
     # What is asked for while something is saved or written waits for its turn.
     assert (seen["begun"], seen["names"]) == ("kane", ["kane", "rice"])
     assert seen["crops"] == ["0001", "0002"]
+    assert seen["split"] == ["To split kane, move to a frame after 100, and not after 299.", True]
+    assert (seen["pair"], seen["given"]) == ([7, 8], True)
     assert seen["written"] == ["usd?run_id=0002", "c3d?run_id=0002"]
     # A held key counts once, but moves on.
     assert (seen["removed"], seen["row"], seen["decided"]) == ([1], "4", ["q1"])

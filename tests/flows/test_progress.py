@@ -179,7 +179,7 @@ def test_pages_read_what_the_command_line_prints(clock, monkeypatch):
     clock[0] += 15.0
     reporter.unit_done("tracking/clip", 15.0, {})
     reporter.unit_waits("tracking/clip", ["50 % of 3.0 s are beyond the limit 5 %"])
-    progress = {"lines": ["tracking, 15 s left"], "percent": 62.0, "stage": "tracking"}
+    progress = {"lines": ["tracking, 15 s left of the run"], "percent": 62.0, "stage": "tracking"}
     assert read_progress(printed.getvalue()) == progress
     reporter.unit_done("tracking/other", 15.0, {})
     progress = {"lines": ["tracking"], "percent": 100.0, "stage": "tracking"}

@@ -50,6 +50,7 @@ def test_keys_move_through_time_colours_and_cameras(seen):
     assert ((seen["last"], seen["stepped"]), seen["colours"]) == ((59, 1), "spread")
     assert seen["through"] == "broadcast"
     assert seen["played"] > 20
+    assert seen["labels"] == [20, 1, 2]
 
 
 def test_the_video_shows_the_frame_of_the_view(seen):

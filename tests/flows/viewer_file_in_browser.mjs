@@ -1,5 +1,6 @@
 // Opens a viewer file from disk, plays and looks; prints what it saw as one JSON object.
 
+import { Labels } from "../../infra/review_pages/src/viewer/labels.js";
 import { open, shoot, task, tell } from "../chromium.mjs";
 
 const seen = { errors: [], outside: [] };
@@ -70,4 +71,9 @@ await page.keyboard.press("Space");
 await page.waitForFunction((from) => Number(document.querySelector("[data-scene]").dataset.frame) > from + 20, first);
 seen.played = (await frame()) - first;
 await page.keyboard.press("Space");
+// Of names at one place in the picture the nearest is written: here the depth is z.
+const M = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0];
+const names = [[0, 0, 4], [0, 0, 2], [1.8, 0, 2]].map((place, k) => [place, "name", [k, 0, 0]]);
+const rows = Labels.prototype.apart.call({ boxes: new Map([["name", [0, 0, 60, 18]]]) }, names, M, 800, 600);
+seen.labels = [rows.length, rows[7], rows[17]];
 await tell(seen);

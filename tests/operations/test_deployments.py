@@ -256,10 +256,13 @@ def test_a_page_starts_a_match_by_its_deployment_and_says_what_it_waits_for(
     assert continuing.state("clicked")["percent"] == 0.0
     assert "once more" in continuing.go_on("clicked")["how"]
     assert len(open_of(prefect, "clicked")) == 2
-    assert continuing.cancel("clicked") and continuing.cancel("clicked-too")
+    assert continuing.running() == {"clicked": False, "clicked-too": True}
+    assert continuing.cancel("clicked", "Ada") and continuing.cancel("clicked-too", "Ada")
     (run,) = open_of(prefect, "clicked")  # the one at work: its worker ends it
     prefect.queue.change(run, "failed", "too dark")
     assert continuing.state("clicked")["lines"] == ["too dark"]
+    prefect.queue.change(prefect.queue.latest(run), "cancelled", "cancelled by Ada")
+    assert continuing.state("clicked")["lines"] == ["Cancelled by Ada."]
 
 
 def test_the_worker_takes_installed_runs_with_parameters_of_their_own_alone(plan):
@@ -440,17 +443,14 @@ def test_the_worker_runs_what_is_due_and_ends_what_is_cancelled(plan, tmp_path, 
         wait_until(lambda: state(held) == "Running" and state(absent) == "Failed")
         pid = int(prefect.ask(f"/flow_runs/{held.flow_run}")["infrastructure_pid"])
         assert is_alive(pid) and prefect.queue.latest(held).pid == pid
-        prefect.cancel(prefect.queue.latest(held), "")
+        prefect.cancel(prefect.queue.latest(held), "cancelled by Ada")
         wait_until(lambda: state(held) == "Cancelled")
     at_work.join(60)
     assert not at_work.is_alive() and not is_alive(pid)
     assert "absent" in prefect.ask(f"/flow_runs/{absent.flow_run}")["state"]["message"]
-    ended = {run.match_id: run for run in prefect.queue.runs()}
-    assert {name: run.state for name, run in ended.items()} == {
-        "absent": "failed",
-        "held": "cancelled",
-    }
-    assert "absent" in ended["absent"].message
+    ended = {run.match_id: (run.state, run.message) for run in prefect.queue.runs()}
+    assert ended["absent"][0] == "failed" and "absent" in ended["absent"][1]
+    assert ended["held"] == ("cancelled", "cancelled by Ada")
 
 
 @pytest.mark.slow  # a worker twice, and the processes of a run

@@ -130,7 +130,7 @@ def test_heartbeats_tell_progress_and_stop_without_it(queue, monkeypatch):
     time.sleep(0.3)
     assert beats(queue, run, 1.0) == 0
     works.set()
-    wait_until(lambda: "2 results left" in queue.beat(run).doing)
+    wait_until(lambda: "2 results of this step left, " in queue.beat(run).doing)
     assert beats(queue, run, 1.0) > 1
     assert queue.beat(run).share == pytest.approx(1 / 3)
     ended.set()

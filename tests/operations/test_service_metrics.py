@@ -226,4 +226,7 @@ def test_the_worst_state_of_a_stage_is_what_is_seen():
     assert f'href="{run}"' in text and 'href="http://127.0.0.1:4200"' in text
     assert '42 %</span> <progress max="100" value="42">' in text
     assert "results/report" not in text  # no run of it is complete
+    waits = StatusRow(match, {"state": "running", "waits": True, "lines": ["1 run is before it."]})
+    assert (waits.words, waits.kind) == ("waiting for its turn", "waiting for its turn")
+    assert '<span class="state">waiting for its turn</span>' in status_html([waits], [], "")
     assert "<script" not in text.replace(OWN, "")

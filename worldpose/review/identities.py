@@ -199,28 +199,32 @@ def find_objection(found: Identities, edit: IdentityEdit) -> str | None:
             return f"clip {edit.clip} has no person {person}"
         if seen is not None and not _is_seen(found, person, seen):
             return (
-                f"person {person} is not the person that was seen in {seen.camera}, frame "
+                f"{_called(found, person)} is not the person that was seen in {seen.camera}, frame "
                 f"{seen.frame}"
             )
     if isinstance(edit, MergedTracks):
         if edit.kept == edit.merged:
-            return f"person {edit.kept} is one person already"
+            return f"{_called(found, edit.kept)} is one person already"
         kept, merged = (found.detection_index[:, :, ids.index(n)] for n, _ in people)
         both = np.flatnonzero(((kept >= 0) & (merged >= 0)).any(axis=1))
         if len(both):
             frame = int(found.frame[both[0]])
             return (
-                f"one camera sees persons {edit.kept} and {edit.merged} side by side in "
-                f"{len(both)} frames, the first is {frame}"
+                f"one camera sees {_called(found, edit.kept)} and {_called(found, edit.merged)} "
+                f"side by side in {len(both)} frames, the first is frame {frame}"
             )
     if isinstance(edit, SplitTrack):
         seen_in = (found.detection_index[:, :, ids.index(edit.person)] >= 0).any(axis=1)
         later = found.frame >= edit.first_frame_of_new
         if not (seen_in & later).any() or not (seen_in & ~later).any():
-            return (
-                f"person {edit.person} is not seen both before and from {edit.first_frame_of_new}"
-            )
+            who, at = _called(found, edit.person), edit.first_frame_of_new
+            return f"{who} is not seen both before and from frame {at}"
     return None
+
+
+def _called(found: Identities, person: int) -> str:
+    name = found.names.get(person)
+    return f"person {person}" if name is None else f"person {person} ({name})"
 
 
 def find_sighting(found: Identities, person: int, first: int = 0) -> Sighting | None:

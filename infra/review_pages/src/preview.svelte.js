@@ -9,7 +9,6 @@ export class Preview {
   refined = $state(null); // of clicks and painted lines; null as soon as something changes
   advice = $state("");
   problem = $state("");
-  seconds = $state(null);
   refining = $state(false);
   asking = $state(false);
   #asked = null;
@@ -62,12 +61,7 @@ export class Preview {
 
   // How long it took until the browser has painted it, with all that the page says of it.
   #shown(since) {
-    requestAnimationFrame(() =>
-      setTimeout(() => {
-        this.seconds = (performance.now() - since) / 1000;
-        performance.measure("preview", { start: since, end: performance.now() });
-      }),
-    );
+    requestAnimationFrame(() => setTimeout(() => performance.measure("preview", { start: since, end: performance.now() })));
   }
 
   async #refine(clicked) {

@@ -1,5 +1,7 @@
 """Corrections of identities, and what other views say about a keypoint."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from camera_builders import look_at_camera
@@ -95,17 +97,17 @@ HERE = Sighting(camera="a", frame=FIRST, detection=0)
     [
         (merge(0, 9), "no person 9"),
         (merge(0, 0), "one person already"),
-        (merge(0, 2), "side by side in 3 frames, the first is 100"),
+        (merge(0, 2), "side by side in 3 frames, the first is frame 100"),
         (merge(1, 0, kept_seen=HERE), "person 1 is not the person that was seen in a, frame 100"),
         (merge(1, 0, merged_seen=HERE.model_copy(update={"camera": "z"})), "is not the person"),
-        (split(0, FIRST), "not seen both before and from 100"),
-        (split(0, FIRST + 3), "not seen both before and from 103"),
+        (split(0, FIRST), "person 0 (kane) is not seen both before and from frame 100"),
+        (split(0, FIRST + 3), "not seen both before and from frame 103"),
         (split(7, FIRST + 3), "no person 7"),
         (NamedTrack(clip="clip", person=1, seen=HERE, name="x"), "is not the person that was seen"),
     ],
 )
 def test_what_does_not_apply_says_why_and_changes_nothing(edit, reason):
-    found = identities()
+    found = replace(identities(), names={0: "kane"})
     replay = replay_identities(found, [edit])
     assert reason in replay.objections[0]
     assert replay.identities is found

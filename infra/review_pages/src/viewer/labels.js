@@ -1,5 +1,7 @@
 // Names in the 3D view: drawn once into a sheet of letters, and from there as rectangles of the picture.
 
+import { project } from "./lens.js";
+
 const HIGH = 18; // px of one line at ratio 1
 
 export class Labels {
@@ -35,9 +37,16 @@ export class Labels {
     for (const which of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, which, gl.CLAMP_TO_EDGE);
   }
 
-  // Row of an instance: the text above a place.
-  row(place, text, color) {
-    return [...place, ...this.boxes.get(text), ...color];
+  // Rows of instances: texts above their places, without those that would overlap a nearer one.
+  apart(found, M, width, height) {
+    const kept = [];
+    const depth = ([[x, y, z]]) => M[3] * x + M[7] * y + M[11] * z + M[15];
+    return found.toSorted((a, b) => depth(a) - depth(b)).flatMap(([place, text, color]) => {
+      const [at, box] = [project(M, place, width, height), this.boxes.get(text)];
+      if (!at || kept.some(([x, y, wide]) => 2 * Math.abs(at[0] - x) < wide + box[2] && Math.abs(at[1] - y) < box[3])) return [];
+      kept.push([...at, box[2]]);
+      return [...place, ...box, ...color];
+    });
   }
 
   destroy() {

@@ -423,21 +423,21 @@ export class Scene3D {
       this.labels = new Labels(gl, [...new Set([...texts, ...this.scene.cameras.map((each) => each.name), ...this.scene.moving])], ratio);
       this.labels.ratio = ratio;
     }
-    const rows = [];
+    const found = [];
     people.forEach((person, number) => {
       if (!person) return;
       const middle = this.#middle(person);
       const top = person.skeleton ? person.skeleton[HEAD] : middle;
       const high = person.feet ? this.#groundAt(middle[1]) + this.#stature(number) + 0.1 : Math.max(top[2] + 0.26, middle[2] + 0.5);
-      rows.push(...this.labels.row([top[0], top[1], high], this.#nameOf(number, Boolean(person.feet)), this.follow === number ? [1, 0.9, 0.4] : [1, 1, 1]));
+      found.push([[top[0], top[1], high], this.#nameOf(number, Boolean(person.feet)), this.follow === number ? [1, 0.9, 0.4] : [1, 1, 1]]);
     });
     for (const name of [...this.scene.cameras.map((each) => each.name), ...this.scene.moving]) {
       const row = this.through === name ? null : this.cameraRow(name);
       if (!row) continue;
       const [x, y, z] = centreOf(row);
-      rows.push(...this.labels.row([x, y, z + 0.16 * this.cameraDepth], name, this.scene.moving.includes(name) ? [1, 0.84, 0.29] : [0.87, 0.91, 0.93]));
+      found.push([[x, y, z + 0.16 * this.cameraDepth], name, this.scene.moving.includes(name) ? [1, 0.84, 0.29] : [0.87, 0.91, 0.93]]);
     }
-    this.words.fill(rows);
+    this.words.fill(this.labels.apart(found, M, width, height));
     const places = this.#use("label", M);
     gl.uniform2f(places.size, width, height);
     gl.uniform2fv(places.sheet, this.labels.size);
