@@ -65,9 +65,14 @@ def read_openpose_folder(folder: Path, model: str | None = None) -> PeopleFile:
     return PeopleFile(people, kind, changed._replace(nobody=nobody, empty=empty))
 
 
+def json_files(folder: Path) -> list[Path]:
+    """Return the JSON files of a folder, without hidden ones such as macOS leaves (`._NAME`)."""
+    return sorted(folder.glob("[!.]*.[jJ][sS][oO][nN]"))
+
+
 def frame_files(folder: Path) -> dict[int, Path]:
     """Return the JSON file of each frame of a camera; errors as of `read_openpose_folder`."""
-    there = {file.name: file for file in sorted(folder.glob("*.[jJ][sS][oO][nN]"))}
+    there = {file.name: file for file in json_files(folder)}
     numbers = frame_numbers(there)
     files: dict[int, Path] = {}
     for name, file in there.items():

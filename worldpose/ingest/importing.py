@@ -17,6 +17,7 @@ from data_contracts.match import MatchSpec
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import LeftOut, camera_id
 from worldpose.formats.calibration_forms import is_of_sensor, read_calibration
+from worldpose.formats.detection_files import json_files
 from worldpose.formats.files import whole_file
 from worldpose.formats.keypoint_files import on_frames, read_people, seen_frames
 from worldpose.formats.keypoint_sets import PeopleFile
@@ -193,8 +194,7 @@ def detections_by_camera(
 def pose_folders(folder: Path) -> list[Path]:
     """Return the folders in a folder that hold 2D poses: JSON, or names `<camera>_json`."""
     there = [place for place in sorted(folder.glob("[!.]*")) if place.is_dir()]
-    json = "*.[jJ][sS][oO][nN]"
-    return [each for each in there if each.name.endswith("_json") or any(each.glob(json))]
+    return [each for each in there if each.name.endswith("_json") or json_files(each)]
 
 
 def import_lenses(

@@ -13,7 +13,7 @@ from worldpose.formats.coco_results import read_coco_results
 from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.formats.keypoint_files import read_people
 from worldpose.formats.keypoint_sets import frame_numbers, order_by_names
-from worldpose.ingest.importing import describe_changes
+from worldpose.ingest.importing import describe_changes, pose_folders
 
 # A standing person in pixels, 400 px tall, of which each set has some points.
 BODY = {
@@ -475,3 +475,12 @@ def test_what_does_not_say_its_frame_or_pixels_is_refused(tmp_path, content, wor
     with pytest.raises(InputError) as caught:
         read_people(tmp_path / "cam.json")
     assert words in str(caught.value)
+
+
+def test_hidden_files_beside_those_of_frames_are_none(tmp_path):
+    folder = frames(tmp_path / "a_json", COCO17)
+    (folder / "._cam_000000000000_keypoints.json").write_bytes(b"\0\5\26\7")
+    assert read_openpose_folder(folder).people.frame.tolist() == [0, 1]
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "._cam_000000000000_keypoints.json").write_bytes(b"\0\5\26\7")
+    assert pose_folders(tmp_path) == [folder]
