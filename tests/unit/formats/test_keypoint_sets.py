@@ -385,10 +385,31 @@ def test_one_rule_for_confidences_missing_people_and_empty_frames(tmp_path):
     np.testing.assert_array_equal(people, [1, 1, 0, 1])
     assert np.isnan(found.people.confidence[3, 0, 0])
     same = [{"image_id": 1, **{"keypoints": one["pose_keypoints_2d"]}} for one in (sure, nobody)]
+    assert_null_is_nan(folder, tmp_path / "b.json", [sure, nobody, lame])
     (tmp_path / "a.json").write_text(json.dumps(same))
     listed = read_coco_results(tmp_path / "a.json")
     assert listed.changes == (17, 1, 0, 0, 0)
     np.testing.assert_array_equal(listed.people.keypoints[0], found.people.keypoints[1])
+
+
+def assert_null_is_nan(folder, file, people):
+    """Assert that null is NaN in both forms, and that entries without a list of points are none."""
+    empty = [{"pose_keypoints_2d": given} for given in (None, [])]
+    text = json.dumps({"people": [*empty, *people]}).replace("NaN", "null")
+    (folder / "cam_000000000001_keypoints.json").write_text(text)
+    found = read_openpose_folder(folder)
+    assert found.changes.nobody == 3
+    assert np.isnan(found.people.confidence[1, :, 0]).tolist() == [False, True]
+    rows = [{"image_id": 1, "keypoints": one["pose_keypoints_2d"]} for one in (*empty, *people)]
+    file.write_text(json.dumps(rows).replace("NaN", "null"))
+    listed = read_coco_results(file)
+    assert (listed.changes.nobody, listed.changes.pointless) == (1, 2)
+    np.testing.assert_array_equal(listed.people.keypoints[0], found.people.keypoints[1])
+    for wrong in ('"500"', f"1{'0' * 400}", "true"):
+        text = json.dumps({"people": people}).replace("500", wrong, 1)
+        (folder / "cam_000000000001_keypoints.json").write_text(text)
+        with pytest.raises(InputError, match=r"pose_keypoints_2d\[0\]: expected a number"):
+            read_openpose_folder(folder)
 
 
 PLACES = np.array([BODY[name] for name in COCO17]) + (500.25, 300.5)
