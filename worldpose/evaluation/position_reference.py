@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +14,7 @@ from data_contracts.arrays import Floats, Integers
 from worldpose.errors import InputError, say_failure
 from worldpose.evaluation.matching import joint_distances, select_frames
 from worldpose.formats.joints_file import JointTracks
+from worldpose.parsing import decode_table
 
 
 def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float]:
@@ -29,7 +32,11 @@ def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float
 
     ours = {"frame_id": "frame", "player_id": "person", "x_m": "x", "y_m": "y"}
     try:
-        table = pd.read_csv(path)
+        text = decode_table(path.read_bytes())
+        separator = max(",;\t", key=text.partition("\n")[0].count)
+        has_commas = separator != "," and re.search(r"\d,\d", text[: 1 << 16])
+        sign = "," if has_commas else "."
+        table = pd.read_csv(io.StringIO(text), sep=separator, decimal=sign)
         ours |= {} if "timestamp" in table else {"time_s": "timestamp"}
         table = table.rename(columns=ours).set_index("frame").sort_index()
         rate = np.nan

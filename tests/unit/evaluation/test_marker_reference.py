@@ -273,6 +273,10 @@ def test_places_of_every_form_and_way_name_the_people(tmp_path, form, way):
     scores, _ = evaluate_joints(predicted, given, fps=25.0)
     assert scores.mpjpe_mm == pytest.approx(100.0)
     assert (scores.coverage, scores.switches, scores.persons) == (1.0, 0, 3)
+    text = file.read_text().replace(",", ";").replace(".", ",")
+    for saved in (text.encode("utf-16"), text.replace("home_7", "home_7\xfc").encode("cp1252")):
+        file.write_bytes(saved)
+        np.testing.assert_array_equal(align_positions(file, mine, 100)[1].joints, given.joints)
 
 
 def test_people_of_one_name_are_told_apart_and_pieces_of_a_track_are_not(tmp_path):
