@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path, PurePosixPath
 from typing import Final, TypeAlias
+from urllib.parse import unquote
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from worldpose.formats.annotations.marked_images import (
     MarkedImage,
     read_marked_images,
 )
+from worldpose.formats.calibration_files import known_id
 from worldpose.formats.files import whole_file
 from worldpose.ingest.annotations import clicked_file, key_frames_file
 from worldpose.ingest.match_folder import read_spec
@@ -187,6 +189,7 @@ def _assign_images(
     """Return camera and images by static camera or clip."""
     static = {camera.id: camera for camera in spec.static_cameras}
     views = spec.broadcast_views
+    owner = owner if owner is None else known_id(owner, [*static, *views])
     if owner in views:
         return {owner: (views[owner].camera, list(images))}
     if owner is not None and owner not in static:
@@ -194,10 +197,12 @@ def _assign_images(
         raise InputError("--camera", f"one of {', '.join([*static, *views])}", repr(owner), todo)
     found: dict[str, tuple[CameraSpec, list[MarkedImage]]] = {}
     for image in images:
-        named = IMAGE_NAME.search(image.name)
-        stem = named[1] if named else PurePosixPath(image.name.replace("\\", "/")).stem
-        # Label Studio puts eight digits before the name of an uploaded file.
-        name = owner or (stem if stem in static else re.sub(r"^[0-9a-f]{8}-", "", stem))
+        place = unquote(image.name)  # Label Studio has addresses
+        named = IMAGE_NAME.search(place)
+        stem = named[1] if named else PurePosixPath(place.replace("\\", "/")).stem
+        # It puts eight digits before the name of an uploaded file.
+        short = stem if stem in static else re.sub(r"^[0-9a-f]{8}-", "", stem)
+        name = owner or known_id(short, static)
         if name not in static or name in found:
             expected = (
                 f"one image per static camera, named <camera>.png or the like: {', '.join(static)}"
