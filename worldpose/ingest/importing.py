@@ -168,6 +168,8 @@ def describe_changes(read: Mapping[str, PeopleFile]) -> list[str]:
     if sparse := [f"{name}: one in {step}" for name, step in steps.items() if step > 1]:
         notes.append(f"2D poses are of some frames alone, by their numbers ({', '.join(sparse)})")
     spans = {name: seen for name, one in read.items() if (seen := seen_frames(one.people))}
+    if nowhere := [name for name in read if name not in spans and spans]:
+        notes.append(f"warning: the 2D poses of {', '.join(nowhere)} have nobody in any frame")
     for name, (first, last) in spans.items():
         others = [span for other, span in spans.items() if other != name]
         if others and not any(start <= last and first <= stop for start, stop in others):

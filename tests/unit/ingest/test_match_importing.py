@@ -241,6 +241,9 @@ def test_a_camera_without_a_common_frame_is_said(tmp_path, source):
     folder = source / "detections"
     _, notes = import_match(source / "calibration.toml", folder, 25.0, tmp_path / "m")
     assert "left has people in frames 5300 to 5302, where no other camera has any" in str(notes)
+    (source / "detections" / "left.json").write_text("[]")
+    _, notes = import_match(source / "calibration.toml", folder, 25.0, tmp_path / "n")
+    assert "warning: the 2D poses of left have nobody in any frame" in notes
 
 
 def test_a_short_video_does_not_shorten_the_match(tmp_path, make_camera):
