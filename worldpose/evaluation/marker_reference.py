@@ -129,8 +129,7 @@ def marker_joints(markers: Markers, people: People) -> Floats:
         for joint, names in found.items():
             for name in names:
                 if (count := markers.names.count(name)) != 1:
-                    found_count = f"{count} of this name" if count else "none"
-                    raise _wrong(f"markers of {person}", f"the marker {name}", found_count)
+                    raise _wrong(f"markers of {person}", f"the marker {name}", f"{count} of it")
             columns = [place[name] for name in names]
             joints[:, row, COCO17.index(joint)] = markers.points[:, columns].mean(1)
     return joints

@@ -48,9 +48,8 @@ def read_openpose_folder(folder: Path, model: str | None = None) -> PeopleFile:
     """
     files = frame_files(folder)
     whole = {frame: _read_frame(files[frame]) for frame in sorted(files)}
-    # Entries of a face or hands alone have an empty list.
     read = {n: people and [each for each in people if len(each)] for n, people in whole.items()}
-    blank = sum(not len(each) for people in whole.values() for each in people or ())
+    blank = sum(not len(each) for people in whole.values() for each in people or ())  # hands
     sizes = {len(one): files[frame] for frame, people in read.items() for one in people or ()}
     if len(sizes) > 1:
         (one, file), (two, other) = list(sizes.items())[:2]

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path, PurePosixPath
 from typing import Final, TypeAlias
-from urllib.parse import unquote
 
 import numpy as np
 
@@ -197,10 +196,10 @@ def _assign_images(
         raise InputError("--camera", f"one of {', '.join([*static, *views])}", repr(owner), todo)
     found: dict[str, tuple[CameraSpec, list[MarkedImage]]] = {}
     for image in images:
-        place = unquote(image.name)  # Label Studio has addresses
+        # Label Studio has addresses, and puts eight digits before the name of an uploaded file.
+        place = re.sub(r"(%[0-9A-Fa-f]{2})+", lambda it: _unquote(it[0]), image.name)
         named = IMAGE_NAME.search(place)
         stem = named[1] if named else PurePosixPath(place.replace("\\", "/")).stem
-        # It puts eight digits before the name of an uploaded file.
         short = stem if stem in static else re.sub(r"^[0-9a-f]{8}-", "", stem)
         name = owner or known_id(short, static)
         if name not in static or name in found:
@@ -212,6 +211,10 @@ def _assign_images(
             raise InputError(f"{file}: {image.name}", expected, these, todo)
         found[name] = (static[name], [image])
     return found
+
+
+def _unquote(text: str) -> str:
+    return bytes.fromhex(text.replace("%", "")).decode(errors="replace")
 
 
 def _records(
