@@ -145,21 +145,24 @@ def _read_c3d(path: Path) -> Markers:
             warnings.filterwarnings("ignore", "No analog data")
             reader = c3d.Reader(file)
             given = reader.get("POINT:UNITS")
-            units = [] if given is None else [_plain_label(each) for each in given.string_array]
-            unit = ", ".join(dict.fromkeys(units)).lower()  # some programs repeat it for each point
+            units = () if given is None else given.string_array
+            units = units if given is None or given.dimensions else (given.string_value,)
+            # Some programs repeat it for each point, or leave the others blank.
+            unit = ", ".join(dict.fromkeys(filter(None, map(_plain_label, units)))).lower()
             names = c3d_labels(reader)
             # Analog channels are not read; the reader fails at a single scale.
             reader.get_analog_transform = lambda: (1.0, 0.0)
             # Copies: the reader reuses its array. Residual -1 means missing.
             rows = [points[:, :4].copy() for _, points, _ in reader.read_frames()]
             rate = float(reader.point_rate)
-            stated = reader.header.last_frame - reader.header.first_frame + 1
+            stated = int(reader.last_frame) - int(reader.first_frame) + 1
     except MemoryError:
         raise
     except Exception as error:  # c3d documents no closed list for damaged files
         raise _wrong(path, "a complete C3D or TRC file", say_failure(error)) from error
     if len(rows) < stated:
-        raise _wrong(path, f"{stated} frames, as its header says", f"{len(rows)}: it was cut off")
+        found = f"{len(rows)}: it was cut off" + ", or is too long for C3D" * (stated >= 65535)
+        raise _wrong(path, f"{stated} frames, as it says", found)
     values = np.array(rows, dtype=np.float64).reshape(len(rows), -1, 4)
     points = np.where(values[..., 3:] < 0.0, np.nan, values[..., :3])
     if not unit:
@@ -198,9 +201,9 @@ def _read_trc(path: Path) -> tuple[float, tuple[str, ...], Floats, str, float]:
     names = tuple(title[::3]) if is_spread else tuple(filter(None, title))
     width = 2 + 3 * len(names)
     cells = [(line.split("\t") + [""] * width)[:width] for line in lines[5:] if line.strip()]
-    stated = about.get("NumFrames", "")
-    if stated.isdecimal() and len(cells) < int(stated) and not text.endswith(("\n", "\r")):
-        raise _wrong(f"{path}: NumFrames", f"{stated} rows", f"{len(cells)}: it was cut off")
+    *_, before, last = (0, 0, *(line.count("\t") + 1 for line in lines[5:]))
+    if 0 < last < before and not text.endswith(("\n", "\r")):
+        raise _wrong(path, f"{before} columns in the last row", f"{last}: it was cut off")
     # Commas beside points are of thousands, and refused.
     has_points = any("." in cell for row in cells for cell in row)
     number = str if has_points else decimal_point

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import re
 import warnings
@@ -14,7 +15,7 @@ from data_contracts.arrays import Floats, Integers
 from worldpose.errors import InputError, say_failure
 from worldpose.evaluation.matching import joint_distances, select_frames
 from worldpose.formats.joints_file import JointTracks
-from worldpose.parsing import decode_table
+from worldpose.parsing import DECIMAL_COMMA, decode_table
 
 
 def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float]:
@@ -32,10 +33,14 @@ def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float
 
     ours = {"frame_id": "frame", "player_id": "person", "x_m": "x", "y_m": "y"}
     try:
-        text = decode_table(path.read_bytes())
+        content = path.read_bytes()
+        is_packed = path.suffix.lower() == ".gz"
+        text = decode_table(gzip.decompress(content) if is_packed else content)
         separator = max(",;\t", key=text.partition("\n")[0].count)
-        has_commas = separator != "," and re.search(r"\d,\d", text[: 1 << 16])
-        sign = "," if has_commas else "."
+        cells = re.split(f"[{separator}\r\n]", text[: 1 << 16])
+        # A name may have a comma between digits beside numbers with points.
+        has_points = any(re.fullmatch(r"[-+]?\d*\.\d+", cell) for cell in cells)
+        sign = "," if not has_points and any(map(DECIMAL_COMMA.fullmatch, cells)) else "."
         table = pd.read_csv(io.StringIO(text), sep=separator, decimal=sign)
         ours |= {} if "timestamp" in table else {"time_s": "timestamp"}
         table = table.rename(columns=ours).set_index("frame").sort_index()

@@ -80,7 +80,8 @@ def read_marked_images(path: Path) -> list[MarkedImage]:
             found = list(decoders[begin](content))
         except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
             raise ContentError(f"no JSON: {error}") from error
-        found = [image if image.name else replace(image, name=path.stem) for image in found]
+        name = path.stem if path.stem.isdecimal() else "picture"
+        found = [image if image.name else replace(image, name=name) for image in found]
         if not any(image.points or image.lines for image in found):
             raise ContentError("no labelled point or line")
         _require_pixels(found, per_cent=begin == b"[")
@@ -307,9 +308,10 @@ class _Dataset(Given):
 def _read_coco(content: bytes) -> Iterator[MarkedImage]:
     given = json.loads(content)
     if isinstance(given, dict) and SOCCERNET_MARKINGS.keys() & {name.strip() for name in given}:
-        yield _read_soccernet("", given)  # its file is named as the picture
+        yield _read_soccernet("", given)  # a number may name its file
         return
-    if isinstance(given, dict) and "data" in given:  # a task of Label Studio alone
+    # A task of Label Studio alone; data sets may have more keys.
+    if isinstance(given, dict) and "data" in given and "images" not in given:
         yield from _read_label_studio(json.dumps([given]).encode())
         return
     if isinstance(given, dict) and isinstance(given.get("annotations"), list):
