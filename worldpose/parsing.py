@@ -152,7 +152,7 @@ def read_cells(path: Path, limit: int, todo: str) -> tuple[list[tuple[int, list[
         content = path.read_bytes()
         if content.startswith((b"PK", b"\xd0\xcf\x11\xe0")):
             raise ValueError("a workbook, not text: save it as CSV")
-        text = _decode_table(content)
+        text = decode_table(content)
         lines = text.splitlines()
         hint = re.fullmatch(r"sep=(.)\W*", lines[0]) if lines else None  # of Excel
         if hint is not None:
@@ -183,7 +183,7 @@ def read_cells(path: Path, limit: int, todo: str) -> tuple[list[tuple[int, list[
     return rows, has_commas
 
 
-def _decode_table(content: bytes) -> str:
+def decode_table(content: bytes) -> str:
     """Return the text of a table."""
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return content.decode("utf-16")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import codecs
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,12 +30,9 @@ from worldpose.parsing import decimal_point
 METRES: Final = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Length of each unit in such files [m]."""
 UNIT_NAMES: Final = {
-    "meter": "m",
-    "meters": "m",
-    "metres": "m",
-    "centimeters": "cm",
-    "millimeters": "mm",
-    "millimetres": "mm",
+    f"{prefix}met{end}": f"{sign}m"
+    for prefix, sign in (("", ""), ("centi", "c"), ("milli", "m"))
+    for end in ("er", "ers", "re", "res")
 }
 """Units as words."""
 SUFFIXES: Final = (".c3d", ".trc")
@@ -116,7 +115,7 @@ def marker_joints(markers: Markers, people: People) -> Floats:
     A joint is the mean of its markers, and missing if one of them is missing.
 
     Raises:
-        InputError: there is no person, or the file lacks a marker.
+        InputError: there is no person, or the file lacks a marker or has it twice.
     """
     if not people:
         raise _wrong(
@@ -128,9 +127,9 @@ def marker_joints(markers: Markers, people: People) -> Floats:
     joints = np.full((len(markers.points), len(people), len(COCO17), 3), np.nan)
     for row, (person, found) in enumerate(people.items()):
         for joint, names in found.items():
-            lacking = [name for name in names if name not in place]
-            if lacking:
-                raise _wrong(f"markers of {person}", f"the marker {lacking[0]}", "none")
+            for name in names:
+                if (count := markers.names.count(name)) != 1:
+                    raise _wrong(f"markers of {person}", f"the marker {name}", f"{count} of it")
             columns = [place[name] for name in names]
             joints[:, row, COCO17.index(joint)] = markers.points[:, columns].mean(1)
     return joints
@@ -142,20 +141,28 @@ def _read_c3d(path: Path) -> Markers:
     except ImportError:
         raise _wrong(path, "the package c3d, which reads it", "none installed") from None
     try:
-        with path.open("rb") as file:
+        with path.open("rb") as file, warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "No analog data")
             reader = c3d.Reader(file)
             given = reader.get("POINT:UNITS")
-            unit = "" if given is None else given.string_value.strip().lower()
+            units = () if given is None else given.string_array
+            units = units if given is None or given.dimensions else (given.string_value,)
+            # Some programs repeat it for each point, or leave the others blank.
+            unit = ", ".join(dict.fromkeys(filter(None, map(_plain_label, units)))).lower()
             names = c3d_labels(reader)
             # Analog channels are not read; the reader fails at a single scale.
             reader.get_analog_transform = lambda: (1.0, 0.0)
             # Copies: the reader reuses its array. Residual -1 means missing.
             rows = [points[:, :4].copy() for _, points, _ in reader.read_frames()]
             rate = float(reader.point_rate)
+            stated = int(reader.last_frame) - int(reader.first_frame) + 1
     except MemoryError:
         raise
     except Exception as error:  # c3d documents no closed list for damaged files
         raise _wrong(path, "a complete C3D or TRC file", say_failure(error)) from error
+    if len(rows) < stated:
+        found = f"{len(rows)}: it was cut off" + ", or is too long for C3D" * (stated >= 65535)
+        raise _wrong(path, f"{stated} frames, as it says", found)
     values = np.array(rows, dtype=np.float64).reshape(len(rows), -1, 4)
     points = np.where(values[..., 3:] < 0.0, np.nan, values[..., :3])
     if not unit:
@@ -171,18 +178,32 @@ def c3d_labels(reader: Any) -> tuple[str, ...]:  # noqa: ANN401
         part = reader.get("POINT:LABELS" + (str(number) if number > 1 else ""))
         if part is None:
             return tuple(names)
-        names += [str(label).strip() for label in part.string_array]
+        names += [_plain_label(label) for label in part.string_array]
         number += 1
+
+
+def _plain_label(text: object) -> str:
+    """Return a text of a C3D file without its padding, of spaces or of zero bytes."""
+    return str(text).strip(" \0\t\r\n")
 
 
 def _read_trc(path: Path) -> tuple[float, tuple[str, ...], Floats, str, float]:
     """Return rate [1/s], names, points (samples, markers, 3), unit and first time [s]."""
     # The first line has the path, in the bytes of the writer's system; only numbers matter.
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    content = path.read_bytes()
+    is_wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    text = content.decode("utf-16" if is_wide else "utf-8", errors="replace")
+    lines = text.splitlines()
     about = dict(zip(lines[1].split("\t"), lines[2].split("\t"), strict=False))
-    names = tuple(name for name in lines[3].split("\t")[2:] if name)
+    title = [cell.strip() for cell in lines[3].rstrip().split("\t")[2:]]
+    # A name stands above its x; a marker without a name has three columns as well.
+    is_spread = not any(name for place, name in enumerate(title) if place % 3)
+    names = tuple(title[::3]) if is_spread else tuple(filter(None, title))
     width = 2 + 3 * len(names)
     cells = [(line.split("\t") + [""] * width)[:width] for line in lines[5:] if line.strip()]
+    *_, before, last = (0, 0, *(line.count("\t") + 1 for line in lines[5:]))
+    if 0 < last < before and not text.endswith(("\n", "\r")):
+        raise _wrong(path, f"{before} columns in the last row", f"{last}: it was cut off")
     # Commas beside points are of thousands, and refused.
     has_points = any("." in cell for row in cells for cell in row)
     number = str if has_points else decimal_point

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gzip
+import io
+import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +15,7 @@ from data_contracts.arrays import Floats, Integers
 from worldpose.errors import InputError, say_failure
 from worldpose.evaluation.matching import joint_distances, select_frames
 from worldpose.formats.joints_file import JointTracks
+from worldpose.parsing import DECIMAL_COMMA, decode_table
 
 
 def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float]:
@@ -29,7 +33,15 @@ def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float
 
     ours = {"frame_id": "frame", "player_id": "person", "x_m": "x", "y_m": "y"}
     try:
-        table = pd.read_csv(path)
+        content = path.read_bytes()
+        is_packed = path.suffix.lower() == ".gz"
+        text = decode_table(gzip.decompress(content) if is_packed else content)
+        separator = max(",;\t", key=text.partition("\n")[0].count)
+        cells = re.split(f"[{separator}\r\n]", text[: 1 << 16])
+        # A name may have a comma between digits beside numbers with points.
+        has_points = any(re.fullmatch(r"[-+]?\d*\.\d+", cell) for cell in cells)
+        sign = "," if not has_points and any(map(DECIMAL_COMMA.fullmatch, cells)) else "."
+        table = pd.read_csv(io.StringIO(text), sep=separator, decimal=sign)
         ours |= {} if "timestamp" in table else {"time_s": "timestamp"}
         table = table.rename(columns=ours).set_index("frame").sort_index()
         rate = np.nan

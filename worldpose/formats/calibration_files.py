@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
@@ -128,6 +128,16 @@ def camera_id(name: str) -> str:
     letters = unicodedata.normalize("NFKD", name)
     plain = "".join(letter for letter in letters if not unicodedata.combining(letter))
     return re.sub(r"[^A-Za-z0-9._-]+", "-", plain).strip("-._") or name
+
+
+def known_id(name: str, known: Collection[str]) -> str:
+    """Return the id among `known` of a camera of a name, or else the name's own id.
+
+    Some programs write underscores for spaces, for which ids have hyphens.
+    """
+    own = camera_id(name)
+    alike = [each for each in known if each.replace("_", "-") == own.replace("_", "-")]
+    return name if name in known else alike[0] if len(alike) == 1 else own
 
 
 def index_by_name(

@@ -285,7 +285,7 @@ def _numbers(where: str, cells: Sequence[str], decimal: str) -> Floats:
 
 def _seconds(text: str) -> float:
     """Return the seconds of a number or of HH:MM:SS.fff, perhaps after a date; NaN for others."""
-    clock = re.fullmatch(r"(?:.*[ T])?(\d+):(\d\d):(\d\d(?:[.,]\d+)?)Z?", text)
+    clock = re.fullmatch(r"(?:.*[ T])?(\d+):(\d\d):(\d\d(?:[.,]\d+)?)(?:Z|[+-]\d\d:?\d\d)?", text)
     if clock:
         hours, minutes, seconds = (float(each.replace(",", ".")) for each in clock.groups())
         return 3600.0 * hours + 60.0 * minutes + seconds

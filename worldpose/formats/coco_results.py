@@ -17,6 +17,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain, takewhile
 from pathlib import Path
+from types import NoneType
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -72,7 +73,8 @@ def read_coco_results(path: Path) -> PeopleFile:
             for each in given:
                 if categories.are_other(each.get("keypoints"), each.get("category_id")):
                     each["keypoints"], foreign = None, foreign + 1
-            results, without = _with_points(given)
+        if items.is_mapping or any(each.get("keypoints") for each in given):
+            results, without = _with_points(given, need_key=not items.is_mapping)
             pointless += without
         batches.append(_read_batch(path, results, first))
     if not items.has_list:
@@ -154,12 +156,15 @@ def _batches(path: Path, items: Iterable[Any]) -> Iterator[tuple[int, list[dict[
         yield index + 1 - len(batch), batch
 
 
-def _with_points(results: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], int]:
-    """Return annotations of a data set, those without points as nobody, and their number."""
+def _with_points(
+    results: list[dict[str, Any]], *, need_key: bool
+) -> tuple[list[dict[str, Any]], int]:
+    """Return results, those without points as nobody, and their number; perhaps of null or []."""
     sizes = [len(given) for each in results if isinstance(given := each.get("keypoints"), list)]
     nobody = {"keypoints": [0.0] * (max(sizes, default=0) or 51), "bbox": None, "box": None}
-    filled = [each if each.get("keypoints") else {**each, **nobody} for each in results]
-    return filled, sum(not each.get("keypoints") for each in results)
+    lack = [each.get("keypoints", need_key) in (None, False, []) for each in results]
+    filled = [{**r, **nobody} if lacks else r for r, lacks in zip(results, lack, strict=True)]
+    return filled, sum(lack)
 
 
 def _read_batch(path: Path, results: list[dict[str, Any]], first: int) -> _Results:
@@ -312,8 +317,8 @@ def _table(
     if width == 1:
         rows = [[row] for row in rows]
     well_formed = set(map(type, rows)) <= {list} and set(map(len, rows)) <= {width}  # type: ignore[arg-type]
-    # Check types, since numpy would accept "1" and True as numbers.
-    if well_formed and set(map(type, chain.from_iterable(rows))) <= {int, float}:  # type: ignore[arg-type]
+    # Check types, since numpy would accept "1" and True as numbers. Null is JSON's NaN.
+    if well_formed and set(map(type, chain.from_iterable(rows))) <= {int, float, NoneType}:  # type: ignore[arg-type]
         try:
             return np.array(rows, dtype=np.float64).reshape(-1, width)
         except OverflowError:  # an integer beyond float64
@@ -333,7 +338,8 @@ def _find_error(
         if len(row) != width:
             return _result_error(path, index, key, what, f"{len(row)}", todo)
         for place, number in enumerate(row):
-            fits = type(number) is float or (type(number) is int and number.bit_length() < 1024)
+            fits = type(number) in (float, NoneType)
+            fits |= type(number) is int and number.bit_length() < 1024
             if not fits:
                 return _result_error(
                     path, index, f"{key}[{place}]", "a number", describe_value(number)

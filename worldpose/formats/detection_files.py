@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from types import NoneType
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.records import FRAME_LIMIT
-from worldpose.errors import InputError
+from worldpose.errors import InputError, describe_value
 from worldpose.formats.files import read_json
 from worldpose.formats.keypoint_sets import (
     COORDINATE_LIMIT,
@@ -46,7 +47,9 @@ def read_openpose_folder(folder: Path, model: str | None = None) -> PeopleFile:
             unknown or a changing number of keypoints; the error names file and key.
     """
     files = frame_files(folder)
-    read = {frame: _read_frame(files[frame]) for frame in sorted(files)}
+    whole = {frame: _read_frame(files[frame]) for frame in sorted(files)}
+    read = {n: people and [each for each in people if len(each)] for n, people in whole.items()}
+    blank = sum(not len(each) for people in whole.values() for each in people or ())  # hands
     sizes = {len(one): files[frame] for frame, people in read.items() for one in people or ()}
     if len(sizes) > 1:
         (one, file), (two, other) = list(sizes.items())[:2]
@@ -62,12 +65,17 @@ def read_openpose_folder(folder: Path, model: str | None = None) -> PeopleFile:
     people, nobody = people_by_frame(folder, frames.astype(np.int64), points)
     people = people.reindex(np.array(list(read), np.int64))
     kind = order.name if found else None
-    return PeopleFile(people, kind, changed._replace(nobody=nobody, empty=empty))
+    return PeopleFile(people, kind, changed._replace(nobody=nobody + blank, empty=empty))
+
+
+def json_files(folder: Path) -> list[Path]:
+    """Return the JSON files of a folder, without hidden ones such as macOS leaves (`._NAME`)."""
+    return sorted(folder.glob("[!.]*.[jJ][sS][oO][nN]"))
 
 
 def frame_files(folder: Path) -> dict[int, Path]:
     """Return the JSON file of each frame of a camera; errors as of `read_openpose_folder`."""
-    there = {file.name: file for file in sorted(folder.glob("*.[jJ][sS][oO][nN]"))}
+    there = {file.name: file for file in json_files(folder)}
     numbers = frame_numbers(there)
     files: dict[int, Path] = {}
     for name, file in there.items():
@@ -110,16 +118,19 @@ def _read_person(where: str, person: Any) -> NDArray[np.float64]:  # noqa: ANN40
     keypoints_keys = ("pose_keypoints_2d", "pose_keypoints", "joints", "keypoints")
     key = next((key for key in keypoints_keys if key in entries), keypoints_keys[0])
     numbers = entries.get(key)
-    if (
-        not isinstance(numbers, list)
-        or len(numbers) not in {3 * size for size in SIZES}
-        or not all(isinstance(one, int | float) and not isinstance(one, bool) for one in numbers)
-    ):
+    if key in entries and numbers in (None, []):
+        return np.empty((0, 3))
+    if not isinstance(numbers, list) or len(numbers) not in {3 * size for size in SIZES}:
         found = f"{len(numbers)} entries" if isinstance(numbers, list) else f"{numbers!r:.40}"
         todo = "Estimate poses with one of these sets (Pose2Sim: pose_model = 'Body_with_feet')."
         raise InputError(
             f"{where}.{key}", f"x, y, confidence of each point, of {KNOWN_SETS} points", found, todo
         )
+    for place, one in enumerate(numbers):  # null, which JSON has for NaN, is a missing point
+        is_huge = type(one) is int and one.bit_length() > 1023
+        if is_huge or type(one) not in (int, float, NoneType):
+            todo = "Write numbers, and 0, 0, 0 or null where a point is missing."
+            raise InputError(f"{where}.{key}[{place}]", "a number", describe_value(one), todo)
     values = np.array(numbers, dtype=np.float64).reshape(-1, 3)
     off = (np.abs(values) > COORDINATE_LIMIT).any(axis=1) | (np.abs(values[:, 2]) > MAX_CONFIDENCE)
     if off.any():

@@ -25,6 +25,7 @@ from worldpose.formats.calibration_files import (
     MODEL_NAMES,
     calibration_error,
     camera_tables,
+    known_id,
     plain_key,
     read_optics,
     tells_model,
@@ -78,6 +79,7 @@ def read_lenses(
             unknown or not named.
     """
     first = files[0]
+    camera = None if camera is None else known_id(camera, sizes)
     if first.suffix.lower() == ".toml":
         content = read_toml(first)
         tables = any(isinstance(each, dict) for each in content.values())
@@ -142,11 +144,12 @@ def _lenses(
     found: dict[str, LensCalibration] = {}
     given = list(tables)
     names = ", ".join(name for _, name, _ in given)
-    for where, name, table in given:
+    for where, called, table in given:
+        name = known_id(called, sizes)
         if camera is not None and name != camera:
             continue
         if name not in sizes:
-            raise _unknown_camera(where, name, sizes)
+            raise _unknown_camera(where, called, sizes)
         if name in found:
             raise calibration_error(where, "a name of its own", f"{name!r} a second time")
         found[name] = _lens(where, name, table, sizes[name])

@@ -25,6 +25,7 @@ from worldpose.formats.annotations.marked_images import (
     MarkedImage,
     read_marked_images,
 )
+from worldpose.formats.calibration_files import known_id
 from worldpose.formats.files import whole_file
 from worldpose.ingest.annotations import clicked_file, key_frames_file
 from worldpose.ingest.match_folder import read_spec
@@ -193,6 +194,7 @@ def _assign_images(
     """Return camera and images by static camera or clip."""
     static = {camera.id: camera for camera in spec.static_cameras}
     views = spec.broadcast_views
+    owner = owner if owner is None else known_id(owner, [*static, *views])
     if owner in views:
         return {owner: (views[owner].camera, list(images))}
     if owner is not None and owner not in static:
@@ -200,10 +202,12 @@ def _assign_images(
         raise InputError("--camera", f"one of {', '.join([*static, *views])}", repr(owner), todo)
     found: dict[str, tuple[CameraSpec, list[MarkedImage]]] = {}
     for image in images:
-        named = IMAGE_NAME.search(image.name)
-        stem = named[1] if named else PurePosixPath(image.name.replace("\\", "/")).stem
-        # Label Studio puts eight digits before the name of an uploaded file.
-        name = owner or (stem if stem in static else re.sub(r"^[0-9a-f]{8}-", "", stem))
+        # Label Studio has addresses, and puts eight digits before the name of an uploaded file.
+        place = re.sub(r"(%[0-9A-Fa-f]{2})+", lambda it: _unquote(it[0]), image.name)
+        named = IMAGE_NAME.search(place)
+        stem = named[1] if named else PurePosixPath(place.replace("\\", "/")).stem
+        short = stem if stem in static else re.sub(r"^[0-9a-f]{8}-", "", stem)
+        name = owner or known_id(short, static)
         if name not in static or name in found:
             expected = (
                 f"one image per static camera, named <camera>.png or the like: {', '.join(static)}"
@@ -213,6 +217,10 @@ def _assign_images(
             raise InputError(f"{file}: {image.name}", expected, these, todo)
         found[name] = (static[name], [image])
     return found
+
+
+def _unquote(text: str) -> str:
+    return bytes.fromhex(text.replace("%", "")).decode(errors="replace")
 
 
 def _records(

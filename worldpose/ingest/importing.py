@@ -17,6 +17,7 @@ from data_contracts.match import MatchSpec
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import LeftOut, camera_id
 from worldpose.formats.calibration_forms import is_of_sensor, read_calibration
+from worldpose.formats.detection_files import json_files
 from worldpose.formats.files import whole_file
 from worldpose.formats.keypoint_files import on_frames, read_people, seen_frames
 from worldpose.formats.keypoint_sets import PeopleFile
@@ -167,6 +168,8 @@ def describe_changes(read: Mapping[str, PeopleFile]) -> list[str]:
     if sparse := [f"{name}: one in {step}" for name, step in steps.items() if step > 1]:
         notes.append(f"2D poses are of some frames alone, by their numbers ({', '.join(sparse)})")
     spans = {name: seen for name, one in read.items() if (seen := seen_frames(one.people))}
+    if nowhere := [name for name in read if name not in spans and spans]:
+        notes.append(f"warning: the 2D poses of {', '.join(nowhere)} have nobody in any frame")
     for name, (first, last) in spans.items():
         others = [span for other, span in spans.items() if other != name]
         if others and not any(start <= last and first <= stop for start, stop in others):
@@ -193,8 +196,7 @@ def detections_by_camera(
 def pose_folders(folder: Path) -> list[Path]:
     """Return the folders in a folder that hold 2D poses: JSON, or names `<camera>_json`."""
     there = [place for place in sorted(folder.glob("[!.]*")) if place.is_dir()]
-    json = "*.[jJ][sS][oO][nN]"
-    return [each for each in there if each.name.endswith("_json") or any(each.glob(json))]
+    return [each for each in there if each.name.endswith("_json") or json_files(each)]
 
 
 def import_lenses(

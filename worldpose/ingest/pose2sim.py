@@ -23,7 +23,7 @@ from worldpose.formats.calibration_forms import (
     is_of_sensor,
     read_calibration,
 )
-from worldpose.formats.detection_files import frame_files, read_openpose_folder
+from worldpose.formats.detection_files import frame_files, json_files, read_openpose_folder
 from worldpose.formats.files import by_last_number, read_toml
 from worldpose.formats.keypoint_files import on_frames
 from worldpose.formats.keypoint_sets import PeopleFile
@@ -192,7 +192,7 @@ def _find_shifts(raw: Path, poses: Mapping[str, Path], notes: list[str]) -> dict
     """
 
     def once(folder: Path) -> dict[bytes, int]:
-        there = frame_files(folder) if any(folder.glob("*.[jJ][sS][oO][nN]")) else {}
+        there = frame_files(folder) if json_files(folder) else {}
         told = {frame: hashlib.sha256(file.read_bytes()).digest() for frame, file in there.items()}
         count = Counter(told.values())
         return {content: frame for frame, content in told.items() if count[content] == 1}

@@ -21,6 +21,7 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.compiled import map_in_threads
 from worldpose.errors import InputError, say_failure
+from worldpose.formats.calibration_files import known_id
 from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.formats.detection_files import read_boxes
 from worldpose.formats.files import FULL, sync_path, whole_file
@@ -233,12 +234,12 @@ def import_boxes(boxes: Path, folder: Path, notes: list[str] | None = None) -> d
     """
     match = read_match(folder, whose=None)
     open_to = {name for name in match.videos if name not in match.detections}
-    known = sorted({file.stem for file in _box_files(boxes)} & match.boxes.keys())
+    asked = [known_id(file.stem, match.videos) for file in _box_files(boxes)]
+    known = sorted({*asked} & match.boxes.keys())
     if known:
         expected = f"no boxes of {known[0]} yet"
         todo = "Remove it first."
         raise InputError(str(folder / "boxes" / f"{known[0]}.txt"), expected, "a file", todo)
-    asked = [file.stem for file in _box_files(boxes)]
     indices = {name: index_video(match.videos[name]) for name in asked if name in open_to}
     return copy_boxes(boxes, {name: indices.get(name) for name in open_to}, folder, notes)
 
@@ -265,8 +266,9 @@ def copy_boxes(
         InputError: there are no files, one of an unknown camera, or an invalid one.
     """
     files = _box_files(boxes)
-    stems = [file.stem for file in files]
-    other = [file.name for file in files if file.stem not in indices or stems.count(file.stem) > 1]
+    names = [known_id(file.stem, indices) for file in files]
+    given = list(zip(names, files, strict=True))
+    other = [file.name for name, file in given if name not in indices or names.count(name) > 1]
     if not files or other:
         raise InputError(
             str(boxes),
@@ -276,15 +278,15 @@ def copy_boxes(
             todo="Rename the files as the cameras.",
         )
     counts = {}
-    for file in files:
-        index = indices[file.stem]
+    for name, file in given:
+        index = indices[name]
         assert index is not None
         read = read_boxes(file, index.size, len(index))
-        counts[file.stem] = len(read.frame)
+        counts[name] = len(read.frame)
         if notes is not None:
             notes += [f"{file.name}: {change}" for change in read.changes]
     (folder / "boxes").mkdir(exist_ok=True)
-    for file in files:
-        with whole_file(folder / "boxes" / f"{file.stem}.txt") as draft:
+    for name, file in given:
+        with whole_file(folder / "boxes" / f"{name}.txt") as draft:
             shutil.copyfile(file, draft)
     return counts

@@ -6,8 +6,8 @@ from pathlib import PurePath
 from typing import Final
 
 VIDEO_SUFFIXES: Final = (
-    *(".3gp", ".avi", ".flv", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg"),
-    *(".mts", ".mxf", ".ts", ".webm", ".wmv"),
+    *(".3gp", ".avi", ".f4v", ".flv", ".m2t", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4"),
+    *(".mpeg", ".mpg", ".mts", ".mxf", ".ogv", ".trp", ".ts", ".vob", ".webm", ".wmv"),
 )
 
 

@@ -129,6 +129,45 @@ def test_rows_of_trc_are_at_their_frames_and_zeros_are_missing(tmp_path, numbers
         read_markers(tmp_path / "a.trc")
 
 
+def test_markers_without_a_name_or_of_one_name_move_no_others(tmp_path):
+    text = ["PathFileType\t4\t(X/Y/Z)\ta.trc", "DataRate\tNumFrames\tUnits", "100\t2\tmeter"]
+    text += ["Frame#\tTime\tA\t\t\t\t\t\tB \t\t\tnose\t\t\tnose\t\t\t", "\t\tX1\tY1\tZ1", ""]
+    text += [f"{n}\t{n / 100}\t" + "\t".join(map(str, range(1, 16))) for n in (1, 2)]
+    file = tmp_path / "a.trc"
+    for encoding in ("utf-8", "utf-16"):
+        file.write_text("\n".join(text) + "\n", encoding)
+        found = read_markers(file)
+        joints = marker_joints(found, {"Ada": {"left_hip": ("A",), "right_hip": ("B",)}})
+        np.testing.assert_array_equal(joints[0, 0, 11:13], [[1, 2, 3], [7, 8, 9]])
+    with pytest.raises(InputError, match="expected the marker nose, found 2 of it"):
+        marker_joints(found, map_marker_names(found.names))
+    file.write_text("\n".join(text)[:-9])
+    with pytest.raises(InputError, match="expected 17 columns in the last row, found 14: it was"):
+        read_markers(file)
+
+
+def test_a_c3d_file_with_zero_bytes_or_many_units_is_read_and_a_cut_one_refused(tmp_path, markers):
+    ezc3d = pytest.importorskip("ezc3d")
+    content = ezc3d.c3d()
+    content["parameters"]["POINT"]["RATE"]["value"] = [RATE]
+    content["parameters"]["POINT"]["LABELS"]["value"] = ["left_hip", "right_hip"]
+    content["parameters"]["POINT"]["UNITS"]["value"] = ["m", "m"]
+    points = np.ones((4, 2, len(markers)))
+    points[:3] = markers[:, 0, 11:13].transpose(2, 1, 0)
+    content["data"]["points"] = points
+    content.write(str(tmp_path / "a.c3d"))
+    whole = (tmp_path / "a.c3d").read_bytes()
+    padded = whole.replace(b"left_hip ", b"left_hip\0")
+    assert padded != whole
+    (tmp_path / "a.c3d").write_bytes(padded)
+    found = read_markers(tmp_path / "a.c3d")
+    assert found.names == ("left_hip", "right_hip")
+    np.testing.assert_allclose(found.points, markers[:, 0, 11:13], atol=1e-5)
+    (tmp_path / "a.c3d").write_bytes(padded[:-9000])
+    with pytest.raises(InputError, match=r"expected 600 frames.*: it was cut off"):
+        read_markers(tmp_path / "a.c3d")
+
+
 def test_joints_are_means_of_markers_as_the_map_says(tmp_path):
     file = tmp_path / "map.yaml"
     file.write_text("Ada: {left_hip: [A, B], nose: C}\n")
@@ -234,6 +273,10 @@ def test_places_of_every_form_and_way_name_the_people(tmp_path, form, way):
     scores, _ = evaluate_joints(predicted, given, fps=25.0)
     assert scores.mpjpe_mm == pytest.approx(100.0)
     assert (scores.coverage, scores.switches, scores.persons) == (1.0, 0, 3)
+    text = file.read_text().replace(",", ";").replace(".", ",")
+    for saved in (text.encode("utf-16"), text.replace("home_7", "home_7\xfc").encode("cp1252")):
+        file.write_bytes(saved)
+        np.testing.assert_array_equal(align_positions(file, mine, 100)[1].joints, given.joints)
 
 
 def test_people_of_one_name_are_told_apart_and_pieces_of_a_track_are_not(tmp_path):

@@ -42,6 +42,7 @@ def read(tmp_path, content, name="data", **options):
         ("time_s", "{:.2f}"),
         ("Time (ms)", "{0:.0f}0"),
         ("timestamp", "2024-05-01 10:59:{:05.2f}"),
+        ("timestamp", "2024-05-01T10:59:{:05.2f}+02:00"),
         ("timecode", "10:59:{:06.3f}"),
     ],
 )

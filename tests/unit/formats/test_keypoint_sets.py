@@ -13,7 +13,7 @@ from worldpose.formats.coco_results import read_coco_results
 from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.formats.keypoint_files import read_people
 from worldpose.formats.keypoint_sets import frame_numbers, order_by_names
-from worldpose.ingest.importing import describe_changes
+from worldpose.ingest.importing import describe_changes, pose_folders
 
 # A standing person in pixels, 400 px tall, of which each set has some points.
 BODY = {
@@ -385,10 +385,31 @@ def test_one_rule_for_confidences_missing_people_and_empty_frames(tmp_path):
     np.testing.assert_array_equal(people, [1, 1, 0, 1])
     assert np.isnan(found.people.confidence[3, 0, 0])
     same = [{"image_id": 1, **{"keypoints": one["pose_keypoints_2d"]}} for one in (sure, nobody)]
+    assert_null_is_nan(folder, tmp_path / "b.json", [sure, nobody, lame])
     (tmp_path / "a.json").write_text(json.dumps(same))
     listed = read_coco_results(tmp_path / "a.json")
     assert listed.changes == (17, 1, 0, 0, 0)
     np.testing.assert_array_equal(listed.people.keypoints[0], found.people.keypoints[1])
+
+
+def assert_null_is_nan(folder, file, people):
+    """Assert that null is NaN in both forms, and that entries without a list of points are none."""
+    empty = [{"pose_keypoints_2d": given} for given in (None, [])]
+    text = json.dumps({"people": [*empty, *people]}).replace("NaN", "null")
+    (folder / "cam_000000000001_keypoints.json").write_text(text)
+    found = read_openpose_folder(folder)
+    assert found.changes.nobody == 3
+    assert np.isnan(found.people.confidence[1, :, 0]).tolist() == [False, True]
+    rows = [{"image_id": 1, "keypoints": one["pose_keypoints_2d"]} for one in (*empty, *people)]
+    file.write_text(json.dumps(rows).replace("NaN", "null"))
+    listed = read_coco_results(file)
+    assert (listed.changes.nobody, listed.changes.pointless) == (1, 2)
+    np.testing.assert_array_equal(listed.people.keypoints[0], found.people.keypoints[1])
+    for wrong in ('"500"', f"1{'0' * 400}", "true"):
+        text = json.dumps({"people": people}).replace("500", wrong, 1)
+        (folder / "cam_000000000001_keypoints.json").write_text(text)
+        with pytest.raises(InputError, match=r"pose_keypoints_2d\[0\]: expected a number"):
+            read_openpose_folder(folder)
 
 
 PLACES = np.array([BODY[name] for name in COCO17]) + (500.25, 300.5)
@@ -475,3 +496,12 @@ def test_what_does_not_say_its_frame_or_pixels_is_refused(tmp_path, content, wor
     with pytest.raises(InputError) as caught:
         read_people(tmp_path / "cam.json")
     assert words in str(caught.value)
+
+
+def test_hidden_files_beside_those_of_frames_are_none(tmp_path):
+    folder = frames(tmp_path / "a_json", COCO17)
+    (folder / "._cam_000000000000_keypoints.json").write_bytes(b"\0\5\26\7")
+    assert read_openpose_folder(folder).people.frame.tolist() == [0, 1]
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "._cam_000000000000_keypoints.json").write_bytes(b"\0\5\26\7")
+    assert pose_folders(tmp_path) == [folder]

@@ -153,21 +153,23 @@ def test_the_short_export_of_label_studio_gives_the_same_clicks(tmp_path):
     given = task["annotations"][0]["result"][1:]
     size = {"original_width": SIZE[0], "original_height": SIZE[1]}
     short = {"image": "east.png", "id": 1, "kp": [each["value"] | size for each in given]}
-    file.write_text(json.dumps([short]))
-    import_clicks(file, match(tmp_path / "m"))
-    points, _ = clicked(tmp_path / "m")
-    for name, pixel in CLICKS.items():
-        np.testing.assert_allclose(points[name], pixel, atol=1e-9)
+    for number, each in enumerate(([short], task)):  # and a task alone, as from the API
+        file.write_text(json.dumps(each))
+        import_clicks(file, match(tmp_path / f"m{number}"))
+        points, _ = clicked(tmp_path / f"m{number}")
+        for name, pixel in CLICKS.items():
+            np.testing.assert_allclose(points[name], pixel, atol=1e-9)
 
 
 def test_lines_of_soccernet_are_clicks_in_its_json_and_by_its_names(tmp_path):
     shares = [{"x": x / SIZE[0], "y": y / SIZE[1]} for x, y in LINE]
     outside = [{"x": 1.2, "y": 0.5}]
     names = {"Side line bottom": shares + outside, "Goal left post left ": shares}
-    (tmp_path / "clicks.json").write_text(json.dumps({**names, "Line unknown": shares}))
-    import_clicks(tmp_path / "clicks.json", match(tmp_path / "m"), "east")
+    (tmp_path / "00012.json").write_text(json.dumps({**names, "Line unknown": shares}))
+    import_clicks(tmp_path / "00012.json", match(tmp_path / "m"), "east")
     _, drawn = clicked(tmp_path / "m")
     assert [each.name for each in drawn] == ["touch_line_near", "goal_post_left_near"]
+    assert read_marked_images(tmp_path / "00012.json")[0].name == "00012"
     np.testing.assert_allclose(drawn[0].xy, LINE, atol=1e-9)
     lines = [("Side line bottom", LINE)]
     import_clicks(cvat(tmp_path / "clicks.xml", [], lines), match(tmp_path / "n"))

@@ -18,9 +18,10 @@ from worldpose.errors import InputError
 from worldpose.formats.calibration_forms import read_calibration
 from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.ingest import registration
+from worldpose.ingest.clicks import import_clicks
 from worldpose.ingest.clock import camera_frames, remaining_offset, simplest_offset
 from worldpose.ingest.footage import UnitFrames, read_unit
-from worldpose.ingest.importing import import_match, import_videos
+from worldpose.ingest.importing import import_lenses, import_match, import_videos
 from worldpose.ingest.match_folder import read_match, require_calibrated
 from worldpose.ingest.pitch_file import read_pitch
 from worldpose.ingest.registration import register_match
@@ -137,6 +138,38 @@ def test_names_with_accents_and_spaces_become_ids_in_either_form(tmp_path, make_
     assert set(read_match(tmp_path / "m").videos) == {"Sudtribune", "Camera-1"}
 
 
+@pytest.mark.parametrize("form", ["NFC", "NFD"])
+def test_boxes_lenses_and_clicks_are_of_the_camera_that_has_their_name(tmp_path, form):
+    name = unicodedata.normalize(form, "S\u00fcd 1")
+    for each in (name, "Camera 2"):
+        film(tmp_path / "videos" / f"{each}.mp4")
+    (tmp_path / "boxes").mkdir()
+    (tmp_path / "boxes" / f"{name}.txt").write_text("1,1,5,5,20,20,1\n")
+    match = tmp_path / "m"
+    import_videos(None, tmp_path / "videos", match, boxes=tmp_path / "boxes")
+    assert [file.name for file in (match / "boxes").iterdir()] == ["Sud-1.txt"]
+    lens = "size = [64, 48]\nmatrix = [[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]]\n"
+    lens += "distortions = [0.0, 0.0, 0.0, 0.0]\n"
+    (tmp_path / "named.toml").write_text(f'[a]\nname = "{name}"\n{lens}', "utf-8")
+    (tmp_path / "one.toml").write_text(lens)
+    assert [*import_lenses([tmp_path / "named.toml"], match)] == ["Sud-1"]
+    assert [*import_lenses([tmp_path / "one.toml"], match, "Camera 2")] == ["Camera-2"]
+    text = (match / "match.yaml").read_text().replace("pitch: none", "")
+    (match / "match.yaml").write_text(text)
+    for image, owner in ((f"{name}.png", "Sud-1"), ("u/0a1b2c3d-Camera_2.png", "Camera-2")):
+        point = '<points label="halfway_far" points="30.5,20.5"/>'
+        shown = f'<image name="{image}" width="64" height="48">{point}</image>'
+        (tmp_path / "c.xml").write_text(f"<annotations>{shown}</annotations>", "utf-8")
+        report = import_clicks(tmp_path / "c.xml", match)
+        assert report.files == [f"annotations/static_calibration/{owner}.json"]
+        (match / report.files[0]).unlink()
+        (tmp_path / "c.xml").write_text(
+            f"<annotations>{shown.replace(image, 'd=x%2FCamera%202.png')}</annotations>"
+        )
+        assert [*import_clicks(tmp_path / "c.xml", match).clicks] == ["Camera-2"]
+        (match / "annotations/static_calibration/Camera-2.json").unlink()
+
+
 def test_a_calibration_is_scaled_to_videos_of_its_shape_and_no_others(tmp_path, make_camera):
     calibration = calibrate(tmp_path, make_camera, ["one", "two"])
     text = calibration.read_text().replace("[64, 48]", "[128, 96]")
@@ -208,6 +241,9 @@ def test_a_camera_without_a_common_frame_is_said(tmp_path, source):
     folder = source / "detections"
     _, notes = import_match(source / "calibration.toml", folder, 25.0, tmp_path / "m")
     assert "left has people in frames 5300 to 5302, where no other camera has any" in str(notes)
+    (source / "detections" / "left.json").write_text("[]")
+    _, notes = import_match(source / "calibration.toml", folder, 25.0, tmp_path / "n")
+    assert "warning: the 2D poses of left have nobody in any frame" in notes
 
 
 def test_a_short_video_does_not_shorten_the_match(tmp_path, make_camera):

@@ -80,6 +80,8 @@ def read_marked_images(path: Path) -> list[MarkedImage]:
             found = list(decoders[begin](content))
         except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
             raise ContentError(f"no JSON: {error}") from error
+        name = path.stem if path.stem.isdecimal() else "picture"
+        found = [image if image.name else replace(image, name=name) for image in found]
         if not any(image.points or image.lines for image in found):
             raise ContentError("no labelled point or line")
         _require_pixels(found, per_cent=begin == b"[")
@@ -306,7 +308,11 @@ class _Dataset(Given):
 def _read_coco(content: bytes) -> Iterator[MarkedImage]:
     given = json.loads(content)
     if isinstance(given, dict) and SOCCERNET_MARKINGS.keys() & {name.strip() for name in given}:
-        yield _read_soccernet("picture", given)
+        yield _read_soccernet("", given)  # a number may name its file
+        return
+    # A task of Label Studio alone; data sets may have more keys.
+    if isinstance(given, dict) and "data" in given and "images" not in given:
+        yield from _read_label_studio(json.dumps([given]).encode())
         return
     if isinstance(given, dict) and isinstance(given.get("annotations"), list):
         marked = [each for each in given["annotations"] if isinstance(each, dict)]
