@@ -18,12 +18,7 @@ from data_contracts.match import MatchSpec
 from data_contracts.pin import Pin
 from data_contracts.release import BaselineSettings, ReleasedClip, ReleaseManifest
 from flows.results import best_results
-from flows.results.outputs import (
-    RELEASE,
-    VIEWER_SUFFIX,
-    own_whole,
-    write_whole,
-)
+from flows.results.outputs import RELEASE, VIEWER_SUFFIX, own_whole, write_whole
 from flows.results.run_cameras import (
     broadcast_views,
     estimated_pitch,

@@ -16,35 +16,28 @@ from worldpose.formats.keypoint_sets import frame_numbers, order_by_names
 from worldpose.ingest.importing import describe_changes, pose_folders
 
 # A standing person in pixels, 400 px tall, of which each set has some points.
+SIDE = {
+    "eye": (8, -8),
+    "ear": (18, -4),
+    "shoulder": (40, 60),
+    "elbow": (50, 130),
+    "wrist": (55, 195),
+    "hip": (25, 190),
+    "knee": (28, 290),
+    "ankle": (30, 390),
+    "big_toe": (40, 410),
+    "small_toe": (48, 405),
+    "heel": (26, 400),
+}
 BODY = {
     "nose": (0, 0),
-    "left_eye": (8, -8),
-    "right_eye": (-8, -8),
-    "left_ear": (18, -4),
-    "right_ear": (-18, -4),
-    "left_shoulder": (40, 60),
-    "right_shoulder": (-40, 60),
-    "left_elbow": (50, 130),
-    "right_elbow": (-50, 130),
-    "left_wrist": (55, 195),
-    "right_wrist": (-55, 195),
-    "left_hip": (25, 190),
-    "right_hip": (-25, 190),
-    "left_knee": (28, 290),
-    "right_knee": (-28, 290),
-    "left_ankle": (30, 390),
-    "right_ankle": (-30, 390),
     "neck": (0, 55),
     "mid_hip": (0, 190),
     "head_top": (0, -30),
     "spine": (0, 130),
     "thorax": (0, 60),
-    "left_big_toe": (40, 410),
-    "left_small_toe": (48, 405),
-    "left_heel": (26, 400),
-    "right_big_toe": (-40, 410),
-    "right_small_toe": (-48, 405),
-    "right_heel": (-26, 400),
+    **{f"left_{name}": place for name, place in SIDE.items()},
+    **{f"right_{name}": (-x, y) for name, (x, y) in SIDE.items()},
 }
 BODY_25B = (*COCO17, "neck", "head_top", *FEET)
 COCO18 = (*BODY25[:8], *BODY25[9:19])
