@@ -14,6 +14,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import psutil
+from page_client import TOKEN
 from service import free_ports
 
 from flows.orchestration.prefect_environment import (
@@ -163,6 +164,7 @@ class Machines:
                 if name == "prefect":
                     environment = served_environment(self.api, self.folder / "prefect")
                     environment[SERVER_LOGIN] = self.environment[CLIENT_LOGIN]
+                    environment["WORLDPOSE_REVIEW_TOKEN"] = TOKEN  # of Prefect's dashboard
                 self.parts[name] = Part(command, environment, self.folder / f"{name}.log")
                 self.parts[name].start()
             self._wait_until(lambda: not problem_at(f"{self.api}/health"))
