@@ -104,7 +104,8 @@ class Stream:
         before, since = -1, time.monotonic()
         while process.poll() is None:
             time.sleep(0.25)
-            made = [*self.project.rglob("manifest.json"), *self.project.glob("runs/*/*")]
+            published = (self.project / "results").rglob("manifest.json")
+            made = [*published, *self.project.glob("runs/*/*")]
             now = (len(made), log.stat().st_size)
             if now != before:
                 before, since = now, time.monotonic()
