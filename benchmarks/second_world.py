@@ -95,6 +95,7 @@ def score_matches(options: Namespace) -> Tables:
     asked = [] if options.report else plans(options)
     for plan in asked:
         if any(plan.items() <= row.items() for row in rows):
+            tell(f"{plan['scenario']} {plan['seed']}: as in {file}, not computed again")
             continue
         keep = options.resume / f"{plan['scenario']}-{plan['seed']}" if options.keep else None
         row = measure_apart(plan, options.limit, keep)

@@ -126,10 +126,11 @@ def _write_joints(
     agreement = reduce(add, agreements).report(model.detector.last_noise.factor)
     if agreement.joints == 0 and index.shape[2]:
         result.warnings.append(_explain_absence(inputs.recipe.name, index, settings))
-    moved = reduce(add, changes).report(model.motion.acceleration, model.motion.repeated)
-    # Without joints, motion and clocks are those assumed, not measured.
-    for report in (agreement, moved, model.clocks.report)[: 3 if agreement.joints else 1]:
-        result.figures.update(figures_of(report, clip.camera_ids))
+    result.figures.update(figures_of(agreement, clip.camera_ids))
+    if agreement.joints:  # motion and clocks are assumed without any, not measured
+        moved = reduce(add, changes).report(model.motion.acceleration, model.motion.repeated)
+        for report in (moved, model.clocks.report):
+            result.figures.update(figures_of(report, clip.camera_ids))
 
 
 def _explain_absence(

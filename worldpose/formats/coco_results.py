@@ -162,7 +162,8 @@ def _with_points(
     """Return results, those without points as nobody, and their number; perhaps of null or []."""
     sizes = [len(given) for each in results if isinstance(given := each.get("keypoints"), list)]
     nobody = {"keypoints": [0.0] * (max(sizes, default=0) or 51), "bbox": None, "box": None}
-    lack = [each.get("keypoints", need_key) in (None, False, []) for each in results]
+    absent = 0 if need_key else None  # a number is no list of points, and refused later
+    lack = [each.get("keypoints", absent) in (None, []) for each in results]
     filled = [{**r, **nobody} if lacks else r for r, lacks in zip(results, lack, strict=True)]
     return filled, sum(lack)
 

@@ -143,6 +143,7 @@ def test_a_confidence_just_below_zero_is_a_missing_joint(read):
         ([with_joint(2, 1, "x", 1)], "result 0, keypoints[7]", "a number"),
         ([with_joint(2, 1, 10**400, 1)], "result 0, keypoints[7]", "a number"),
         ([person(keypoints=[1.0] * 50)], "result 0, keypoints", "51 numbers"),
+        ([person(), person(keypoints=0)], "result 1, keypoints", "51 numbers"),
         ([person(), person(keypoints=[1.0] * 75)], "result 1, keypoints", "found 75"),
         ([person(keypoints=[1.0] * 30)], "cam1.json", "found 10 points"),
         ([person("a.jpg")], "result 0, image_id", "'a.jpg'"),
