@@ -283,7 +283,7 @@ def import_pitch(
             str(file),
             expected="no pitch there yet",
             found="one",
-            todo="Move the file away first; another pitch makes another match.",
+            todo="Move the file away first.",
         )
     fit = fit_survey(
         read_survey(survey, template or "football"), SurveySettings(left_handed=left_handed)

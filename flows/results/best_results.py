@@ -269,11 +269,6 @@ def _extra_tracks(
     return ExtraTracks(points, joints, covariance, views)
 
 
-def has_joints(run: Run, clip: str) -> bool:
-    """Return whether some person of a clip has a joint in 3D."""
-    return bool(np.isfinite(joint_tracks(run, clip).joints).any())
-
-
 def tracked_people(run: Run, clip: str) -> tuple[xr.Dataset, dict[int, Track]]:
     """Return the tracking of one clip, and its people by id, with their newest names."""
     plane = f"{PLANE}/{clip}"

@@ -369,7 +369,7 @@ def _export(origin: best_results.Origin, forms: list[str], out: Path) -> list[Pa
     """
     require_formats(forms, origin.stage)
     of_people = [form for form in forms if form not in (*POSITION_FORMATS, *OF_CAMERAS)]
-    has = not of_people or any(best_results.has_joints(origin.run, clip) for clip in origin.clips)
+    has = not of_people or any(np.isfinite(origin.tracks(c).joints).any() for c in origin.clips)
     chosen = dict.fromkeys(forms if has else ())
     written = [path for form in chosen for path in EXPORTS[form](origin, out)]
     if not written:

@@ -38,7 +38,6 @@ STARTING: Final = timedelta(minutes=5)
 machine."""
 SOON: Final = timedelta(minutes=1)
 """A run that is due later waits for its time; if it was due before, the clock was set back."""
-KILLED: Final = "its process was killed"
 ACTIVE: Final = ("SCHEDULED", "PENDING", "RUNNING", "CANCELLING", "PAUSED")
 
 LOG = logging.getLogger("worldpose.operations")
@@ -125,21 +124,22 @@ def _recover(
     kind = None if there is None else there["state_type"]
     is_over = there is not None and kind not in ACTIVE
     killed: QueuedRun | None = run
+    why = (there or {}).get("state", {}).get("message") or "cancelled at Prefect"
     if run.state == "begun":
         if kind == "PAUSED":  # suspended, and killed before the queue was told
             runs.queue.change(run, "waiting", "for review")
             return False
         if kind == "CANCELLING":
-            runs.set_state(run.flow_run, kind := "CANCELLED", KILLED)
+            runs.set_state(run.flow_run, kind := "CANCELLED", why)
         else:
             has_worker = find_process(run.worker_pid, "flows.service.child") is not None
-            killed = runs.queue.kill(run, KILLED, by_service=not has_worker)
+            killed = runs.queue.kill(run, "its process was killed", by_service=not has_worker)
     elif run.state == "asked" and is_over and kind != "CANCELLED":
         killed = runs.queue.kill(run, str((there or {})["state"]["message"]))
     if killed is None:
         return False
     if kind == "CANCELLED":
-        runs.queue.change(killed, "cancelled", "cancelled at Prefect")
+        runs.queue.change(killed, "cancelled", why)
         return False
     if killed.state == "failed":
         if there is not None and not is_over:

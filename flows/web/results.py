@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 from threading import Lock
 from typing import Annotated, Any, Final
 
+import numpy as np
 from fastapi import APIRouter, HTTPException, Query
 from fastapi.responses import FileResponse, Response
 
@@ -25,7 +26,7 @@ from flows.results.best_results import (
     clips_of,
     describe_later,
     find_clips,
-    has_joints,
+    joint_tracks,
     open_results,
     tracked_people,
 )
@@ -145,7 +146,7 @@ def _player_names(match: Match, run: Run) -> dict[str, str]:
 
 def why_without_joints(run: Run, clip: str) -> str | None:
     """Return why no person of a clip has joints in 3D; None if some person has."""
-    if has_joints(run, clip):
+    if np.isfinite(joint_tracks(run, clip, definition="detector").joints).any():
         return None
     unit = f"tracking/{clip}"
     said = run.manifest(unit).warnings if unit in run else ()

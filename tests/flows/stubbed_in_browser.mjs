@@ -72,7 +72,7 @@ async function showNewRun() {
     if (path.endsWith("/crop")) crops.push(new URLSearchParams(search).get("run_id"));
     if (!path.includes("/identities/") || path.endsWith("/crop")) return null;
     await wait(slow);
-    return { clip: "half", fps: 25, first_frame: 100, frame_count: 200, step: 1, pitch: null, roster: [], events: [], has_video: true, joins: [], people: [7, 8].map((id) => trackOf(id, names[id] ?? null)) };
+    return { clip: "half", fps: 25, first_frame: 100, frame_count: 200, step: 1, pitch: null, roster: [], events: [], has_video: true, joins: [{ before: 8, after: 7, last_frame: 150, first_frame: 160 }], people: [7, 8].map((id) => trackOf(id, names[id] ?? null)) };
   });
   await page.click("summary >> text=Metrics per camera");
   await page.click("summary >> text=Clocks of the cameras");
@@ -103,10 +103,13 @@ async function showNewRun() {
   await wait(4);
   seen.names = sent;
   seen.crops = [...new Set(crops)];
-  // Nobody is seen before the first frame; two people are joined without Shift.
+  // Nobody is seen before the first frame; two people are joined without Shift, and not those of a question in between.
   await page.click('[data-person="7"] .bar', { position: { x: 1, y: 4 } });
   seen.split = [await page.locator("[data-split]").innerText(), await page.locator("[data-tracks] button >> text=Split").isDisabled()];
   await page.click("button >> text=Join two");
+  await page.click(".join .plain");
+  await page.click('[data-person="7"]');
+  await page.click("button >> text=Join two", { timeout: 5000 });
   await page.click('[data-person="8"]');
   await page.click("button >> text=Join two");
   await wait(2);

@@ -25,6 +25,7 @@ from flows.results.best_results import Origin
 from flows.results.export import CLASHING, COUNTED, EXPORTS, OF_CAMERAS, POSITION_FORMATS, export
 from flows.results.outputs import OWNERS
 from worldpose.errors import InputError, UsageError, WorldposeError
+from worldpose.formats.joints_file import read_joints
 from worldpose.geometry.lens_models import LensModel
 
 __all__ = ["match_folder"]  # a fixture
@@ -111,6 +112,17 @@ def test_strange_results_are_written_or_refused(match_folder, tmp_path, form, ca
         assert all(path.is_relative_to(out) for path in written)
         there = {path for path in out.rglob("*") if path.is_file()}
         assert there == {*written, out / OWNERS}, "no draft is left"
+
+
+def test_joints_of_people_of_whom_none_has_a_body_are_written(match_folder, tmp_path):
+    offsets = (("joint", "coordinate"), np.zeros((17, 3)))
+    fits = without_joints()["body_fitting__A_1"].assign(joint_offsets=offsets)
+    results = whole() | {"body_fitting__A_1": fits}
+    every = replace(origin(match_folder, **results), definition="detector")
+    joints, *_ = export(every, ["joints"], tmp_path / "out")
+    assert np.isfinite(read_joints(joints).joints).any()
+    with pytest.raises(InputError, match="expected a person with joints"):
+        export(replace(every, definition="body"), ["joints"], tmp_path / "bodies")
 
 
 def test_an_export_is_repeated_into_its_folder_and_joined_by_others(match_folder, tmp_path):

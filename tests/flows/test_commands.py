@@ -233,6 +233,8 @@ def test_a_clip_much_longer_than_its_2d_poses_is_told_where_files_are_given(
     (tmp_path / "draft" / "match").mkdir()
     _, notes = build(Store.open_or_new(tmp_path / "new"), content, tmp_path / "draft", {})
     assert any(told in note for note in notes) == is_told
+    _, notes = build(store, content, tmp_path / "draft", {}, "a")  # ingest told it
+    assert not any(told in note for note in notes)
 
 
 def test_a_match_of_the_second_world_is_made_by_name(tmp_path):

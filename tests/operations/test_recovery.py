@@ -250,6 +250,15 @@ def test_a_run_that_was_killed_while_it_was_suspended_waits_for_its_review(
     assert queue.latest(run).state == "waiting"
 
 
+def test_a_cancelled_run_that_was_killed_says_who_cancelled_it(queue, plan):
+    run = queue.change(queue.take(a_run()), "begun", pid=None)
+    runs = SimpleNamespace(queue=queue, set_state=lambda *_: None)
+    there = {"state_type": "CANCELLING", "state": {"message": "cancelled by Ada"}}
+    assert not recovery._recover(plan, runs, run, there, timedelta(0))
+    ended = queue.latest(run)
+    assert (ended.state, ended.message) == ("cancelled", "cancelled by Ada")
+
+
 def test_a_process_with_the_number_of_a_run_is_not_taken_for_it(queue):
     begun = queue.change(queue.take(a_run()), "begun", pid=os.getpid(), host=platform.node())
     assert find_process(begun.pid, begun.flow_run) is None

@@ -6,6 +6,7 @@ import gzip
 import io
 import re
 import warnings
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -82,7 +83,7 @@ def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float
         if not 1.5 < reach < 200.0 or not table.index.is_unique:
             raise ValueError(f"{len(names)} people at places up to {reach:g} in {len(x)} rows")
         return table.index.to_numpy(np.int64), names, np.stack([x, y], axis=-1), rate
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, EOFError, zlib.error, ValueError, KeyError) as error:
         raise InputError(
             str(path),
             expected="frame_id, each once, and places of people in metres from the centre spot",

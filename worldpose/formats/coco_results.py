@@ -91,7 +91,7 @@ def read_coco_results(path: Path) -> PeopleFile:
             there = f"{pointless} annotations, {share} of categories other than {categories.called}"
             todo = "Give people the category that names their keypoints."
         raise InputError(f"{path}: annotations", "keypoints of people", there, todo)
-    if items.is_mapping and np.all(np.isin(points[..., 2], (0, 1, 2))):
+    if items.is_mapping and np.isin(np.nan_to_num(points[..., 2]), (0, 1, 2)).all():
         points[..., 2] = np.minimum(points[..., 2], 1)  # visibility: 1 occluded, 2 visible
     sure = points[..., 2]
     wrong_scale = np.abs(sure) > MAX_CONFIDENCE  # NaN is a missing point, as below 0

@@ -144,8 +144,8 @@ def uncovered_clips(match: MatchFolder) -> Iterator[str]:
         seen[unit] = people.frame[np.isfinite(people.score).any(axis=1)]
     for clip in spec.clips:
         units = [*(camera.id for camera in spec.static_cameras), *spec.views_of(clip.id)]
-        if not {*units} <= seen.keys():
-            continue  # a detector finds the people of the others
+        if not units or not {*units} <= seen.keys():
+            continue  # no camera films it, or a detector finds the people of the others
         first, last = clip.first_frame, clip.first_frame + clip.frame_count - 1
         frame = np.concatenate([seen[unit] for unit in units])
         frame = frame[(frame >= first) & (frame <= last)]
@@ -155,7 +155,7 @@ def uncovered_clips(match: MatchFolder) -> Iterator[str]:
             where = f"only in frames {begin} to {end}" if len(frame) else "in no frame"
             yield (
                 f"clip {clip.id}: it has frames {first} to {last}, and 2D poses {where}. Shorten "
-                "it in match.yaml (first_frame, frame_count), or give the 2D poses of the rest."
+                "it (first_frame, frame_count), or give the 2D poses of the rest."
             )
 
 

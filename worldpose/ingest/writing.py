@@ -268,7 +268,7 @@ def copy_boxes(
     files = _box_files(boxes)
     names = [known_id(file.stem, indices) for file in files]
     given = list(zip(names, files, strict=True))
-    other = [file.name for name, file in given if name not in indices or names.count(name) > 1]
+    other = [file.name for name, file in given if not indices.get(name) or names.count(name) > 1]
     if not files or other:
         raise InputError(
             str(boxes),

@@ -3,6 +3,7 @@
 import json
 import struct
 import zlib
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -17,7 +18,13 @@ from data_contracts.match import MatchSpec
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
 from worldpose.errors import InputError
 from worldpose.ingest.clock import ImageClock, rows_at
-from worldpose.ingest.footage import footage_size, image_clock, read_still, unit_frames
+from worldpose.ingest.footage import (
+    footage_size,
+    image_clock,
+    read_still,
+    uncovered_clips,
+    unit_frames,
+)
 from worldpose.ingest.match_folder import read_match, require_calibrated
 from worldpose.ingest.writing import MatchAnnotations
 
@@ -60,6 +67,12 @@ def test_a_camera_of_several_has_its_name_after_the_clips(broadcast, names):
 def test_cameras_and_offsets_that_cannot_be_assigned_are_refused(broadcast, offsets, told):
     with pytest.raises(ValidationError, match=told):
         match(broadcast, offsets)
+
+
+def test_a_clip_that_no_camera_films_lacks_no_2d_poses():
+    clips = {"goal": {"frame_count": 6, "broadcast": "tv"}, "later": {"frame_count": 6}}
+    spec = match_spec({"tv": {"kind": "broadcast"}}, clips, fps=50.0)
+    assert [*uncovered_clips(SimpleNamespace(spec=spec, detections={}))] == []
 
 
 def test_each_view_has_its_own_size_rate_and_offset():

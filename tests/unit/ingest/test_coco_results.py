@@ -88,12 +88,15 @@ def test_an_entry_without_joints_and_box_is_nobody(read):
     np.testing.assert_array_equal(people.score[0], np.array([0.9, 0.5], dtype=np.float32))
 
 
-def test_data_set_annotations_may_carry_visibility(read):
+def test_data_set_annotations_may_carry_visibility(tmp_path):
     hidden = with_joint(4, 50, 60, 1)
     hidden["keypoints"][2::3] = [2] * 17
     hidden["keypoints"][3 * 4 + 2] = 1
     hidden["keypoints"][3 * 5 + 2] = 0
-    people = read({"images": [], "annotations": [hidden]})
+    hidden["keypoints"][3 * 7 : 3 * 8] = [None] * 3
+    (tmp_path / "cam1.json").write_text(json.dumps({"images": [], "annotations": [hidden]}))
+    people, _, changes = read_coco_results(tmp_path / "cam1.json")
+    assert changes.clamped == 0
     assert (people.confidence[0, 0, 4], people.confidence[0, 0, 6]) == (1, 1)
     assert np.isnan(people.confidence[0, 0, 5])
 

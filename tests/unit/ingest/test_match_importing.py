@@ -25,6 +25,7 @@ from worldpose.ingest.importing import import_lenses, import_match, import_video
 from worldpose.ingest.match_folder import read_match, require_calibrated
 from worldpose.ingest.pitch_file import read_pitch
 from worldpose.ingest.registration import register_match
+from worldpose.ingest.writing import copy_boxes
 from worldpose.video.files import write_video
 
 
@@ -148,6 +149,8 @@ def test_boxes_lenses_and_clicks_are_of_the_camera_that_has_their_name(tmp_path,
     match = tmp_path / "m"
     import_videos(None, tmp_path / "videos", match, boxes=tmp_path / "boxes")
     assert [file.name for file in (match / "boxes").iterdir()] == ["Sud-1.txt"]
+    with pytest.raises(InputError, match="Rename the files"):  # as beside another Sud-1
+        copy_boxes(tmp_path / "boxes", {"Sud_1": None}, match)
     lens = "size = [64, 48]\nmatrix = [[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]]\n"
     lens += "distortions = [0.0, 0.0, 0.0, 0.0]\n"
     (tmp_path / "named.toml").write_text(f'[a]\nname = "{name}"\n{lens}', "utf-8")
