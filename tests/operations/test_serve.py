@@ -101,8 +101,9 @@ def test_a_second_service_of_a_project_and_an_absent_server_are_refused(tmp_path
         answer = worldpose("serve", "--project", project)
         assert answer.code == 2
         assert "another process" in answer.err
-    absent = {"PREFECT_API_URL": f"http://127.0.0.1:{free_ports(1)[0]}/api"}
-    answer = worldpose("serve", "--project", project, environment=absent)
+    server, pages = free_ports(2)
+    absent = {"PREFECT_API_URL": f"http://127.0.0.1:{server}/api"}
+    answer = worldpose("serve", "--project", project, "--port", pages, environment=absent)
     assert answer.code == 2
     assert "running Prefect server" in answer.err
     with pytest.raises(urllib.error.URLError):
