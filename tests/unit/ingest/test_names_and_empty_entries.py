@@ -28,8 +28,8 @@ SIZE = (48, 64)
 POINTS = [value for n in range(17) for value in (100.0 + n, 200.0 + 2 * n, 0.5)]
 
 
-def level(number):
-    return np.full((*SIZE, 3), 10 + 16 * number, np.uint8)
+def level(number, size=SIZE):
+    return np.full((*size, 3), 10 + 16 * number, np.uint8)
 
 
 def number_of(picture):
@@ -227,12 +227,12 @@ CONTAINERS = {
 }
 
 
-def encode(path, form, codec, pixels, count=12):
+def encode(path, form, codec, pixels, size=SIZE):
     with av.open(str(path), "w", format=form) as container:
         stream = container.add_stream(codec, 25)
-        stream.height, stream.width, stream.pix_fmt = *SIZE, pixels
-        for number in range(count):
-            frame = av.VideoFrame.from_ndarray(level(number), format="rgb24")
+        stream.height, stream.width, stream.pix_fmt = *size, pixels
+        for number in range(12):
+            frame = av.VideoFrame.from_ndarray(level(number, size), format="rgb24")
             container.mux(stream.encode(frame.reformat(format=pixels)))
         container.mux(stream.encode(None))
 
@@ -262,7 +262,7 @@ def test_content_tells_a_video_only_where_no_name_does(tmp_path):
 
 
 def test_frames_of_a_program_stream_are_found_by_number_where_a_packet_has_several(tmp_path):
-    encode(tmp_path / "a.mpg", "mpeg", "mpeg1video", "yuv420p")
+    encode(tmp_path / "a.mpg", "mpeg", "mpeg1video", "yuv420p", (144, 192))
     with VideoReader(tmp_path / "a.mpg") as video:
         assert [number_of(video.frame(n)) for n in (11, 7, 6, 2, 7)] == [11, 7, 6, 2, 7]
 
