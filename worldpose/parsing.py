@@ -203,8 +203,8 @@ def _unpack(content: bytes) -> bytes:
     most = 1 << 30
     try:
         if content.startswith(b"\x1f\x8b"):
-            with gzip.open(io.BytesIO(content)) as file:
-                content = file.read(most + 1)
+            with gzip.open(io.BytesIO(content)) as packed:
+                content = packed.read(most + 1)
         elif content.startswith(b"PK"):
             with zipfile.ZipFile(io.BytesIO(content)) as archive:
                 names = [

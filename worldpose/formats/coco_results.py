@@ -78,7 +78,7 @@ def read_coco_results(path: Path) -> PeopleFile:
                 if is_other or (is_empty and each.get("iscrowd") == 1):  # one box of many people
                     each.update(keypoints=None, bbox=None, box=None)
                     foreign += is_other
-        batches.append(batch := _read_batch(path, results, first))
+        batches.append(batch := _read_batch(path, results, first, is_set=items.is_mapping))
         for each, lacks in zip(results, batch.lacks.tolist(), strict=True):
             category = sys.intern(str(each.get("category_id")))
             (pointless_of.append if lacks else posed.add)(category)
@@ -169,13 +169,22 @@ def _batches(path: Path, items: Iterable[Any]) -> Iterator[tuple[int, list[dict[
         yield index + 1 - len(batch), batch
 
 
-def _read_batch(path: Path, results: list[dict[str, Any]], first: int) -> _Results:
-    """Return results; null, an empty list or nothing in place of points is none of them."""
+def _read_batch(path: Path, results: list[dict[str, Any]], first: int, *, is_set: bool) -> _Results:
+    """Return results; null or an empty list in place of points is none of them.
+
+    So is no list at all, in a data set or beside a box.
+    """
     max_points = 1000  # maximum points of a person
     images = _images(path, results, first)
-    lacks = np.array([each.get("keypoints") in (None, []) for each in results])
+    lacks = np.array(
+        [
+            each.get("keypoints", None if is_set or each.get("bbox") or each.get("box") else 0)
+            in (None, [])
+            for each in results
+        ]
+    )
     posed = np.flatnonzero(~lacks).tolist()
-    given = results[posed[0]]["keypoints"] if posed else []
+    given = results[posed[0]].get("keypoints") if posed else []
     width = len(given) if type(given) is list and len(given) % 3 == 0 else 51
     if width > 3 * max_points:
         raise unknown_size(f"{path}: result {first + posed[0]}, keypoints", width // 3)

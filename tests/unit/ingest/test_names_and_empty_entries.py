@@ -123,8 +123,11 @@ def test_entries_without_points_mean_the_same_wherever_they_are(tmp_path, before
         found = read_coco_results(tmp_path / "a.json")
         assert found.people.frame.tolist() == [before]
         assert found.changes.pointless == before
-    (tmp_path / "a.json").write_text(json.dumps(empty or [{"image_id": 0}]))
+    (tmp_path / "a.json").write_text(json.dumps(empty or [{"image_id": 0, "bbox": [1] * 4}]))
     with pytest.raises(InputError, match=f"found {max(before, 1)} entries without keypoints"):
+        read_coco_results(tmp_path / "a.json")
+    (tmp_path / "a.json").write_text(json.dumps([*full, {"image_id": 0}]))
+    with pytest.raises(InputError, match="result 1, keypoints: expected 78 numbers"):
         read_coco_results(tmp_path / "a.json")
 
 
