@@ -10,9 +10,12 @@ from __future__ import annotations
 
 import codecs
 import csv
+import gzip
+import io
 import math
 import re
 import zipfile
+import zlib
 from collections.abc import Callable, Collection
 from pathlib import Path
 from threading import RLock
@@ -130,6 +133,22 @@ def decimal_point(text: str) -> str:
     return text.replace(",", ".") if DECIMAL_COMMA.fullmatch(text) else text
 
 
+def clock_seconds(cell: object) -> float:
+    """Return the seconds of a number, or of [HH:]MM:SS.fff, perhaps after days or a date.
+
+    The frames of a time code, HH:MM:SS:FF, are left out; NaN for any other text.
+    """
+    text = str(cell).strip()
+    days, clock = r"(?:(-?\d+) days?,? |.*[ T])?", r"([-+]?)(?:(\d+):)?(\d+):(\d\d(?:[.,]\d+)?)"
+    if found := re.fullmatch(days + clock + r"(?:[:;]\d\d)?(?:Z|[+-]\d\d:?\d\d)?", text):
+        day, sign, *parts = found.groups()
+        hours, minutes, seconds = (float((each or "0").replace(",", ".")) for each in parts)
+        within = 3600.0 * hours + 60.0 * minutes + seconds
+        return 86400.0 * float(day or 0) + (-within if sign == "-" else within)
+    number = re.fullmatch(r"-?\d+(?:[.,]\d+)?(?:e[-+]?\d+)?", text.lower())
+    return float(text.replace(",", ".")) if number else math.nan
+
+
 def read_cells(path: Path, limit: int, todo: str) -> tuple[list[tuple[int, list[str]]], bool]:
     """Return the rows of a table as spreadsheets save it, and whether it has decimal commas.
 
@@ -149,11 +168,7 @@ def read_cells(path: Path, limit: int, todo: str) -> tuple[list[tuple[int, list[
             raise ValueError("something else" if path.exists() else "nothing")
         if path.stat().st_size > limit:
             raise ValueError(f"{path.stat().st_size} bytes, more than {limit}")
-        content = path.read_bytes()
-        if content.startswith((b"PK", b"\xd0\xcf\x11\xe0")):
-            raise ValueError("a workbook, not text: save it as CSV")
-        text = decode_table(content)
-        lines = text.splitlines()
+        lines = decode_table(path.read_bytes()).splitlines()
         hint = re.fullmatch(r"sep=(.)\W*", lines[0]) if lines else None  # of Excel
         if hint is not None:
             lines[0] = ""
@@ -183,8 +198,37 @@ def read_cells(path: Path, limit: int, todo: str) -> tuple[list[tuple[int, list[
     return rows, has_commas
 
 
+def _unpack(content: bytes) -> bytes:
+    """Return the only file of a zip archive, or that of gzip; other bytes as they are."""
+    most = 1 << 30
+    try:
+        if content.startswith(b"\x1f\x8b"):
+            with gzip.open(io.BytesIO(content)) as packed:
+                content = packed.read(most + 1)
+        elif content.startswith(b"PK"):
+            with zipfile.ZipFile(io.BytesIO(content)) as archive:
+                names = [
+                    n for n in archive.namelist() if not re.search(r"/$|(^|/)(\.|__MACOSX/)", n)
+                ]
+                if {"[Content_Types].xml", "content.xml"} & {*names}:
+                    raise ValueError("a workbook, not text: save it as CSV")
+                if len(names) != 1:
+                    found = f"{len(names)} files, {', '.join(names):.200}"
+                    raise ValueError(f"an archive of {found}: give one of them")
+                with archive.open(names[0]) as file:
+                    content = file.read(most + 1)
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
+        raise ValueError(f"a damaged or locked archive: {error}") from error
+    if len(content) > most:
+        raise ValueError(f"an archive of more than {most} bytes")
+    return content
+
+
 def decode_table(content: bytes) -> str:
-    """Return the text of a table."""
+    """Return the text of a table, perhaps the only one in an archive."""
+    content = _unpack(content)
+    if content.startswith(b"\xd0\xcf\x11\xe0"):
+        raise ValueError("a workbook, not text: save it as CSV")
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return content.decode("utf-16")
     if b"\0" in content:

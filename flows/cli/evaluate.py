@@ -121,9 +121,10 @@ def evaluate(
         _require_effect("submissions", given, ())
         _print_challenge(Path(prediction[0]), Path(reference))
         return
-    from flows.results.evaluation import Reading, is_of_files, score
+    from flows.results.evaluation import TABLES, Reading, is_of_files, score
 
-    of_reference = {".csv": "--first-frame", ".c3d": "--markers", ".trc": "--markers"}
+    of_reference = {**dict.fromkeys(TABLES, "--first-frame"), ".c3d": "--markers"}
+    of_reference[".trc"] = "--markers"
     allowed = ("--match-in", "--fps", of_reference.get(Path(reference).suffix.lower(), ""))
     of_run = () if is_of_files(prediction[0]) else ("--run", "--stage")
     _require_effect("this prediction and reference", given, (*allowed, *of_run))

@@ -36,6 +36,9 @@ from worldpose.pitch.template import PitchTemplate
 from worldpose.store.runs import LATEST
 from worldpose.store.store import Store
 
+TABLES = (".csv", ".tsv", ".gz", ".zip")
+"""Endings of tables of positions."""
+
 
 @dataclass(frozen=True, eq=False)
 class Scores:
@@ -108,7 +111,7 @@ def score(
         InputError: a file has the wrong format.
     """
     suffix, notes = Path(reference).suffix.lower(), list[str]()
-    measured, placed = suffix in SUFFIXES, suffix == ".csv"
+    measured, placed = suffix in SUFFIXES, suffix in TABLES
     truth = Side(None, {}) if measured or placed else reference_side(reference)
     estimate = _prediction(prediction, project, truth, run_id=run_id, stage=stage)
     match, known = estimate.match or truth.match, fps or estimate.fps or truth.fps

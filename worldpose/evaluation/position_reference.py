@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import io
 import re
 import warnings
@@ -16,7 +15,7 @@ from data_contracts.arrays import Floats, Integers
 from worldpose.errors import InputError, say_failure
 from worldpose.evaluation.matching import joint_distances, select_frames
 from worldpose.formats.joints_file import JointTracks
-from worldpose.parsing import DECIMAL_COMMA, decode_table
+from worldpose.parsing import DECIMAL_COMMA, clock_seconds, decode_table
 
 
 def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float]:
@@ -26,6 +25,7 @@ def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float
 
     The file is a CSV of `worldpose export --format positions`, or of kloppy's `to_df`: columns
     `<player>_x` and `<player>_y`, or `player_id`, x and y, beside `frame_id`. The ball is left out.
+    An archive may hold it.
 
     Raises:
         InputError: the file has another form, or places that cannot be metres from the centre spot.
@@ -34,9 +34,7 @@ def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float
 
     ours = {"frame_id": "frame", "player_id": "person", "x_m": "x", "y_m": "y"}
     try:
-        content = path.read_bytes()
-        is_packed = path.suffix.lower() == ".gz"
-        text = decode_table(gzip.decompress(content) if is_packed else content)
+        text = re.sub(r"\Asep=.\s*", "", decode_table(path.read_bytes()))  # of Excel
         separator = max(",;\t", key=text.partition("\n")[0].count)
         cells = re.split(f"[{separator}\r\n]", text[: 1 << 16])
         # A name may have a comma between digits beside numbers with points.
@@ -50,7 +48,12 @@ def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float
             each = table.groupby(level=0).first()
             time = each["timestamp"]
             if is_text := not pd.api.types.is_numeric_dtype(time):
-                time = pd.to_timedelta(time, errors="coerce").dt.total_seconds()
+                seconds = time.map(clock_seconds)
+                if (odd := time[seconds.isna() & time.notna()]).size:
+                    raise ValueError(
+                        f"the time {odd.iloc[0]!r:.40}, neither 00:01:02.5 nor seconds"
+                    )
+                time = seconds
             period = pd.factorize(each["period_id"])[0] if "period_id" in each else 0.0 * time
             rows = np.array([time.index, time, period], np.float64)
             # A clock may be coarser than a frame: only rows at which it moves on are exact.

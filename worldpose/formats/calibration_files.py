@@ -210,7 +210,7 @@ def read_calibration_toml(
         tables = posed
     cameras = []
     for where, name, given in tables:
-        table = _with_size(given, sizes.get(camera_id(name)))
+        table = _with_size(given, sizes.get(known_id(name, sizes)))
         if _has_lens_alone(table):
             expected = "the pose of the camera, rotation and translation"
             todo = (

@@ -24,6 +24,7 @@ from worldpose.formats.calibration_files import (
     calibration_error,
     camera_id,
     index_by_name,
+    known_id,
     read_calibration_toml,
     read_camera_table,
 )
@@ -334,7 +335,7 @@ def _read_easymocap(
             f"Add the width and height of the calibrated images: a line W_{name}: 1920 and a line "
             f"H_{name}: 1080."
         )
-        known = None if f"W_{name}" in lenses else sizes.get(camera_id(name))
+        known = None if f"W_{name}" in lenses else sizes.get(known_id(name, sizes))
         if known is not None:
             lenses |= {f"W_{name}": float(known[0]), f"H_{name}": float(known[1])}
         if f"W_{name}" not in lenses or f"H_{name}" not in lenses:

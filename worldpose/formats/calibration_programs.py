@@ -20,6 +20,7 @@ from worldpose.formats.calibration_files import (
     calibration_error,
     camera_id,
     index_by_name,
+    known_id,
     read_camera_table,
 )
 from worldpose.formats.calibration_unit import require_middle
@@ -193,7 +194,7 @@ def read_openpose_cameras(
     cameras = []
     for file in files:
         given, where = read_file_storage(file), str(file)
-        size = sizes.get(camera_id(file.stem))
+        size = sizes.get(known_id(file.stem, sizes))
         if size is None:
             expected = f"the image size of camera {file.stem}, which OpenPose's files lack"
             todo = "Import the calibration with --videos, or write it as TOML with a size."

@@ -23,7 +23,7 @@ from data_contracts.conventions import UNITS
 from worldpose.errors import InputError
 from worldpose.formats.calibration_unit import other_middle
 from worldpose.formats.tables import write_rows
-from worldpose.parsing import read_cells
+from worldpose.parsing import clock_seconds, read_cells
 
 _BYTES: Final = 1 << 26
 """Maximum size of a file [byte]: twelve hours of packets at 50 Hz."""
@@ -248,7 +248,7 @@ def _read_columns(
         cells = [row[place].strip() if place < len(row) else "" for _, row in rows[1:]]
         where = f"{path}: column {title}"
         if (timed := _TIME.fullmatch(text)) and "time" not in columns:
-            seconds = np.array([_seconds(cell) for cell in cells])
+            seconds = np.array([clock_seconds(cell) for cell in cells])
             seconds *= _SECONDS.get(timed[1] or "", 1.0)
             if len(cells) > 1 and np.isfinite(seconds).all():
                 # A coarse clock or a counter places no row; in a stated unit it can be a fault.
@@ -281,16 +281,6 @@ def _numbers(where: str, cells: Sequence[str], decimal: str) -> Floats:
         if np.isinf(values[n]):
             raise _wrong(f"{where}: entry {n + 1}", "a number", repr(text))
     return values
-
-
-def _seconds(text: str) -> float:
-    """Return the seconds of a number or of HH:MM:SS.fff, perhaps after a date; NaN for others."""
-    clock = re.fullmatch(r"(?:.*[ T])?(\d+):(\d\d):(\d\d(?:[.,]\d+)?)(?:Z|[+-]\d\d:?\d\d)?", text)
-    if clock:
-        hours, minutes, seconds = (float(each.replace(",", ".")) for each in clock.groups())
-        return 3600.0 * hours + 60.0 * minutes + seconds
-    number = re.fullmatch(r"-?\d+(?:[.,]\d+)?(?:e[-+]?\d+)?", text.lower())
-    return float(text.replace(",", ".")) if number else np.nan
 
 
 def _is_fine(time: Floats) -> bool:
@@ -328,7 +318,7 @@ def _read_table(path: Path, fps: float, size: tuple[int, int]) -> CameraData:
     _take_middle(path, columns, left_out, size)
     notes = [f"columns left out: {', '.join(left_out)}"] if left_out else []
     if any(re.search(r"[.,]\d{3,}$", code) for code in codes) and "time" not in columns:
-        columns["time"], codes = np.array([_seconds(code) for code in codes]), []
+        columns["time"], codes = np.array([clock_seconds(code) for code in codes]), []
     if "frame" not in columns and codes:
         frame = np.array([_frames(path, n, text, fps) for n, text in enumerate(codes, 1)])
         columns["frame"] = frame - frame[0]

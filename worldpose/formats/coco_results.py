@@ -14,6 +14,7 @@ The frame is a whole `image_id`, or the number in an `image_id` that is a file's
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain, takewhile
 from pathlib import Path
@@ -34,13 +35,13 @@ from worldpose.formats.keypoint_sets import (
     PeopleFile,
     clean_points,
     describe_fault,
-    frame_numbers,
     order_by_names,
     order_by_points,
     people_by_frame,
     unknown_size,
 )
 from worldpose.formats.pose_forms import plain_entries
+from worldpose.video.names import frame_numbers
 
 BATCH = 4096
 """Results per batch of Python objects."""
@@ -66,31 +67,43 @@ def read_coco_results(path: Path) -> PeopleFile:
     items = JsonItems(path, "annotations", json_bytes, keep, other_key="instance_info")
     categories = _categories(path, json_bytes)
     entries = plain_entries(str(path), items)
-    batches, pointless, foreign = [], 0, 0
-    for first, given in _batches(path, entries):
-        results = given
+    batches, foreign = [], 0
+    posed, pointless_of = set[str](), list[str]()  # categories with points, and of entries without
+    for first, results in _batches(path, entries):
         if items.is_mapping:
-            for each in given:
-                if categories.are_other(each.get("keypoints"), each.get("category_id")):
-                    each["keypoints"], foreign = None, foreign + 1
-        if items.is_mapping or any(each.get("keypoints") for each in given):
-            results, without = _with_points(given, need_key=not items.is_mapping)
-            pointless += without
-        batches.append(_read_batch(path, results, first))
+            for each in results:
+                given = each.get("keypoints")
+                is_other = categories.are_other(given, each.get("category_id"))
+                is_empty = not given or (isinstance(given, list) and not any(given))
+                if is_other or (is_empty and each.get("iscrowd") == 1):  # one box of many people
+                    each.update(keypoints=None, bbox=None, box=None)
+                    foreign += is_other
+        batches.append(batch := _read_batch(path, results, first, is_set=items.is_mapping))
+        for each, lacks in zip(results, batch.lacks.tolist(), strict=True):
+            category = sys.intern(str(each.get("category_id")))
+            (pointless_of.append if lacks else posed.add)(category)
     if not items.has_list:
         expected = "a list of COCO keypoint results, a COCO data set with `annotations`, or the "
         expected += "results of MMPose or Ultralytics"
         there = describe_value(items.other or ", ".join(items.seen))
         raise InputError(str(path), expected, there, "Export the poses as COCO keypoint results.")
-    found = _join(path, batches)
-    points = found.points
-    if pointless and pointless == len(points):
-        there, todo = f"{pointless} annotations without keypoints", "Export poses, not boxes alone."
+    if batches and not posed:
+        count = len(pointless_of)
+        what = "annotations" if items.is_mapping else "entries"
+        there, todo = f"{count} {what} without keypoints", "Export poses, not boxes alone."
         if foreign:
-            share = "all" if foreign == pointless else foreign
-            there = f"{pointless} annotations, {share} of categories other than {categories.called}"
+            share = "all" if foreign == count else foreign
+            there = f"{count} annotations, {share} of categories other than {categories.called}"
             todo = "Give people the category that names their keypoints."
         raise InputError(f"{path}: annotations", "keypoints of people", there, todo)
+    found = _join(path, batches)
+    points = found.points
+    if items.is_mapping:
+        posed.discard("None")
+    # A box alone is a person's if others of its category have points; a ball has another one.
+    alone = np.flatnonzero(found.lacks)
+    found.boxes[alone[np.array([each not in posed for each in pointless_of], bool)]] = np.nan
+    pointless = int(np.isnan(found.boxes[alone]).any(axis=1).sum())
     if items.is_mapping and np.isin(np.nan_to_num(points[..., 2]), (0, 1, 2)).all():
         points[..., 2] = np.minimum(points[..., 2], 1)  # visibility: 1 occluded, 2 visible
     sure = points[..., 2]
@@ -113,32 +126,32 @@ def read_coco_results(path: Path) -> PeopleFile:
 
 
 class _Results(NamedTuple):
-    """Some results: their images' ids, points (n, points, 3), boxes (n, 4) and scores (n,)."""
+    """Some results: their images' ids, points (n, points, 3), boxes (n, 4) and scores (n,).
+
+    `lacks` (n,) tells which ones have no points.
+    """
 
     images: list[int | str]
     points: NDArray[np.float32]
     boxes: NDArray[np.float64]
     scores: NDArray[np.float64]
+    lacks: NDArray[np.bool_]
 
 
 def _join(path: Path, batches: Sequence[_Results]) -> _Results:
     """Return all results, which must have the same points; a batch without any takes theirs."""
-    sizes = sorted({batch.points.shape[1] for batch in batches if batch.points.any()})
-    if sizes:
-        batches = [
-            batch
-            if batch.points.any()
-            else batch._replace(points=np.zeros((len(batch.images), sizes[0], 3), np.float32))
-            for batch in batches
-        ]
+    sizes = sorted({batch.points.shape[1] for batch in batches if not batch.lacks.all()})
     if len(sizes) > 1:
         raise _wrong(str(path), "the same points of all people", f"{sizes[0]} and {sizes[1]}")
-    if not batches:
-        empty = np.empty
-        return _Results([], empty((0, 17, 3), np.float32), empty((0, 4)), empty(0))
-    images = list(chain.from_iterable(batch.images for batch in batches))
-    arrays = zip(*(batch[1:] for batch in batches), strict=True)
-    return _Results(images, *(np.concatenate(each) for each in arrays))
+    size = sizes[0] if sizes else len(COCO17)
+    none = np.empty((0, 0, 3), np.float32), np.empty((0, 4)), np.empty(0), np.empty(0, np.bool_)
+    images, points, *others = zip(_Results([], *none), *batches, strict=True)
+    rows = [
+        np.zeros((len(each), size, 3), np.float32) if lacks.all() else each
+        for each, lacks in zip(points, others[-1], strict=True)
+    ]
+    arrays = map(np.concatenate, [rows, *others])
+    return _Results(list(chain.from_iterable(images)), *arrays)
 
 
 def _batches(path: Path, items: Iterable[Any]) -> Iterator[tuple[int, list[dict[str, Any]]]]:
@@ -156,27 +169,29 @@ def _batches(path: Path, items: Iterable[Any]) -> Iterator[tuple[int, list[dict[
         yield index + 1 - len(batch), batch
 
 
-def _with_points(
-    results: list[dict[str, Any]], *, need_key: bool
-) -> tuple[list[dict[str, Any]], int]:
-    """Return results, those without points as nobody, and their number; perhaps of null or []."""
-    sizes = [len(given) for each in results if isinstance(given := each.get("keypoints"), list)]
-    nobody = {"keypoints": [0.0] * (max(sizes, default=0) or 51), "bbox": None, "box": None}
-    absent = 0 if need_key else None  # a number is no list of points, and refused later
-    lack = [each.get("keypoints", absent) in (None, []) for each in results]
-    filled = [{**r, **nobody} if lacks else r for r, lacks in zip(results, lack, strict=True)]
-    return filled, sum(lack)
+def _read_batch(path: Path, results: list[dict[str, Any]], first: int, *, is_set: bool) -> _Results:
+    """Return results; null or an empty list in place of points is none of them.
 
-
-def _read_batch(path: Path, results: list[dict[str, Any]], first: int) -> _Results:
+    So is no list at all, in a data set or beside a box.
+    """
     max_points = 1000  # maximum points of a person
     images = _images(path, results, first)
-    given = results[0].get("keypoints")
+    lacks = np.array(
+        [
+            each.get("keypoints", None if is_set or each.get("bbox") or each.get("box") else 0)
+            in (None, [])
+            for each in results
+        ]
+    )
+    posed = np.flatnonzero(~lacks).tolist()
+    given = results[posed[0]].get("keypoints") if posed else []
     width = len(given) if type(given) is list and len(given) % 3 == 0 else 51
-    if not 0 < width <= 3 * max_points:
-        raise unknown_size(f"{path}: result {first}, keypoints", width // 3)
-    table = _table(path, results, range(len(results)), "keypoints", width, first)
-    points = table.reshape(-1, width // 3, 3)
+    if width > 3 * max_points:
+        raise unknown_size(f"{path}: result {first + posed[0]}, keypoints", width // 3)
+    points = np.zeros((len(results), width // 3, 3))
+    if posed:
+        table = _table(path, results, posed, "keypoints", width, first)
+        points[posed] = table.reshape(len(posed), width // 3, 3)
     near = ~np.any(np.abs(points) > COORDINATE_LIMIT, axis=-1)
     certain = f"pixels up to {COORDINATE_LIMIT:g} (a missing point is 0, 0, 0)"
     _require_right(path, points, near, first, certain, _COUNT_TODO)
@@ -185,7 +200,7 @@ def _read_batch(path: Path, results: list[dict[str, Any]], first: int) -> _Resul
             result["bbox"] = result.get("box")
     boxes = _optional(path, results, "bbox", 4, first)
     scores = _optional(path, results, "score", 1, first)[:, 0]
-    return _Results(images, points.astype(np.float32), boxes, scores)
+    return _Results(images, points.astype(np.float32), boxes, scores, lacks)
 
 
 def _images(path: Path, results: list[dict[str, Any]], first: int) -> list[int | str]:

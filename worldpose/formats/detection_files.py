@@ -25,12 +25,12 @@ from worldpose.formats.keypoint_sets import (
     PeopleFile,
     clean_points,
     describe_fault,
-    frame_numbers,
     order_by_points,
     people_by_frame,
 )
 from worldpose.formats.pose_forms import plain_person
 from worldpose.parsing import read_cells
+from worldpose.video.names import frame_numbers
 
 
 def read_openpose_folder(folder: Path, model: str | None = None) -> PeopleFile:
@@ -99,7 +99,7 @@ def _read_frame(file: Path) -> list[NDArray[np.float64]] | None:
     if not file.stat().st_size:
         return None
     content = read_json(file)
-    known = ("people", "bodies", "instance_info", "results")
+    known = ("people", "bodies", "instance_info", "results", "annots")  # the last of EasyMocap
     keys = [key for key in known if isinstance(content, dict) and key in content]
     people = content[keys[0]] if keys else content
     if content == []:
@@ -113,10 +113,13 @@ def _read_frame(file: Path) -> list[NDArray[np.float64]] | None:
 
 
 def _read_person(where: str, person: Any) -> NDArray[np.float64]:  # noqa: ANN401
-    entries = plain_person(person) or (person if isinstance(person, dict) else {})
+    entries = (person if isinstance(person, dict) else {}) | (plain_person(person) or {})
     # Of OpenPose's version 1 and later, of its versions 0, and of other programs.
     keypoints_keys = ("pose_keypoints_2d", "pose_keypoints", "joints", "keypoints")
-    key = next((key for key in keypoints_keys if key in entries), keypoints_keys[0])
+    named = [key for key in keypoints_keys if key in entries]
+    key = next(
+        (key for key in named if entries[key] not in (None, [])), (*named, *keypoints_keys)[0]
+    )
     numbers = entries.get(key)
     if key in entries and numbers in (None, []):
         return np.empty((0, 3))

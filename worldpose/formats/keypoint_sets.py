@@ -8,10 +8,9 @@ two sets of one size. Points that worldpose does not use are left out.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -20,9 +19,9 @@ from numpy.typing import NDArray
 from data_contracts.arrays import AnyFloats, Flags, Floats
 from data_contracts.conventions import COCO17, FEET
 from data_contracts.keypoints import KeypointDetections
-from data_contracts.records import FRAME_LIMIT
 from worldpose.body.keypoints import BODY25
 from worldpose.errors import InputError, describe_value
+from worldpose.video.names import frame_numbers
 
 MAX_CONFIDENCE: Final = 2.0
 """Largest confidence that counts as 1 [1]: peaks of heat maps and of SimCC exceed 1; a larger one
@@ -33,47 +32,6 @@ PEOPLE_LIMIT: Final = 1000
 """Maximum people per frame of one camera; a stadium's stands in one image have a few hundred."""
 COORDINATE_LIMIT: Final = 1e6
 """Maximum absolute coordinate of a keypoint or box corner [px]."""
-
-
-_NUMBER: Final = re.compile(r"[A-Za-z]*(\d{1,18})")
-_SOURCE: Final = re.compile(r"(cam|camera|clip|view)\d", re.IGNORECASE)
-
-
-def frame_numbers(names: Iterable[str]) -> dict[str, int]:
-    """Return the frame in each name of a picture or its file; those without a number are left out.
-
-    It is the number that differs from name to name and can be a frame: of `000012_cam1.png` and
-    `frame12_1700000000480.png` it is 12. Of several such, it is the one with the smallest steps.
-    A part that mixes letters and digits, such as 1080p or a digest, is no number; `frame12` is 12.
-    The number of a camera or clip, as in `cam1`, counts in names without another. Roboflow puts a
-    digest after the name: `frame_12_jpg.rf.3fa9`.
-
-    The numbers of names without such a place are their last ones. So they are if the last one is
-    the same in all names and a single other one differs: that may be the camera's or the clip's.
-    No name has a frame if the numbers before it repeat, and it neither rises with them nor counts
-    on where they change: it is a time of day, or there are several clips.
-    """
-    found: dict[str, list[int]] = {}
-    for name in set(names):
-        stem = PureWindowsPath(name).stem.partition(".rf.")[0]
-        parts = [p for p in map(_NUMBER.fullmatch, re.split(r"[^A-Za-z0-9]+", stem)) if p]
-        if numbers := [p for p in parts if not _SOURCE.match(p[0])] or parts:
-            found[name] = [int(p[1]) for p in numbers]
-    count = min(map(len, found.values()), default=0)
-    values = {place: {each[-place] for each in found.values()} for place in range(1, count + 1)}
-    differing = [place for place, there in values.items() if len(there) > 1]
-    distinct = [p for p in values if len(values[p]) == len(found) and max(values[p]) <= FRAME_LIMIT]
-    chosen = min(distinct, key=lambda p: max(values[p]) - min(values[p]), default=1)
-    if 1 not in differing and len(differing) == 1:
-        chosen = 1
-    rows = sorted((numbers[-chosen], numbers[-count:-chosen]) for numbers in found.values())
-    before = [part for _, part in rows]
-    groups = len(set(map(tuple, before)))
-    if before != sorted(before) and groups < len(found):
-        steps = [b[0] - a[0] for a, b in pairwise(rows) if a[1] != b[1]]
-        if len(steps) >= groups or set(steps) != {1}:  # a time begins again each second
-            return {}
-    return {name: numbers[-chosen] for name, numbers in found.items()}
 
 
 def describe_fault(name: object, numbers: Mapping[Any, int], otherwise: str) -> tuple[str, str]:
@@ -267,8 +225,9 @@ def order_by_points(where: str, points: AnyFloats, stated: str | None = None) ->
     # Landmarks of a face, such as 300-W's, are 68 points too, of which none is hidden.
     most = plausible if is_doubtful or chosen.name == "HALPE-68" else wrong
     is_unknown = is_doubtful and np.isnan(misfit)
-    if (is_unknown and len(points)) or (
-        misfit > most and len(points) >= (1 if most == plausible else fewest)
+    people = np.count_nonzero((points[..., 2] > 0.0).any(axis=1))
+    if (is_unknown and people) or (
+        misfit > most and people >= (1 if most == plausible else fewest)
     ):
         model = f" of model {stated.strip()!r:.40}" if stated and named is None else ""
         found = f"others: the points{model} have another order"

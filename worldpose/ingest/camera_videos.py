@@ -17,6 +17,7 @@ from worldpose.errors import InputError
 from worldpose.formats.calibration_files import camera_id
 from worldpose.formats.calibration_unit import scaled
 from worldpose.ingest.footage import stretches
+from worldpose.video.files import holds_video
 from worldpose.video.folder import SUFFIXES, numbered_images, open_video
 from worldpose.video.names import VIDEO_SUFFIXES, is_video
 from worldpose.video.pictures import FrameIndex
@@ -43,10 +44,9 @@ def find_videos(
     Raises:
         InputError: two videos have one name, or chapters are not to be joined.
     """
-    there = sorted(folder.glob("[!.]*"))
-    videos = [file for file in there if is_video(file)]
+    videos = _films_in(folder)
     groups = [[file] for file in videos] if named else _recordings(videos)
-    for place in (each for each in there if each.is_dir()):
+    for place in (each for each in sorted(folder.glob("[!.]*")) if each.is_dir()):
         inside = [[place]] if _has_images(place) else _recordings_in(place)
         groups += [group for group in inside if len(group) > 1 or len(inside) == 1]
     found: dict[str, Path] = {}
@@ -76,7 +76,7 @@ def without_strays(
 
     Beside videos in the folder itself, the only video of a subfolder may be anything.
     """
-    is_mixed = any(map(is_video, folder.glob("[!.]*")))
+    is_mixed = bool(_films_in(folder))
     return {
         name: file
         for name, file in found.items()
@@ -84,8 +84,16 @@ def without_strays(
     }
 
 
+def _films_in(folder: Path) -> list[Path]:
+    """Return the videos of a folder by their endings; if none has one, by their content."""
+    most = 200  # files whose content is looked at: cameras are fewer
+    files = [file for file in sorted(folder.glob("[!.]*")) if file.is_file()]
+    named = [*filter(is_video, files)]
+    return named if named or len(files) > most else [*filter(holds_video, files)]
+
+
 def _recordings_in(place: Path) -> list[list[Path]]:
-    return _recordings([file for file in sorted(place.glob("[!.]*")) if is_video(file)])
+    return _recordings(_films_in(place))
 
 
 def describe_unused(folder: Path, used: Collection[Path]) -> list[str]:
@@ -93,8 +101,9 @@ def describe_unused(folder: Path, used: Collection[Path]) -> list[str]:
     others: list[str] = []
     inner: list[Path] = []
     strays: list[Path] = []
+    films = _films_in(folder)
     for place in sorted(folder.glob("[!.]*")):
-        if place.is_file() and not is_video(place):
+        if place.is_file() and place not in films:
             others.append(place.name)
         elif place.is_dir() and _has_images(place):
             inner += [each for each in place.glob("[!.]*") if each.suffix.lower() not in SUFFIXES]

@@ -32,6 +32,7 @@ from worldpose.ingest.match_folder import read_spec
 from worldpose.ingest.pitch_file import pitch_file, read_pitch, require_free_pitch
 from worldpose.pitch.laws import prescribed_points
 from worldpose.pitch.template import PitchTemplate
+from worldpose.video.names import frame_numbers
 
 COORDINATES: Final = re.compile(r"\(?\s*(-?\d+(?:\.\d+)?)\s*[,;_ ]\s*(-?\d+(?:\.\d+)?)\s*\)?")
 """A label that is a place, such as `(16.5, 13.84)` [m]."""
@@ -202,10 +203,8 @@ def _assign_images(
         raise InputError("--camera", f"one of {', '.join([*static, *views])}", repr(owner), todo)
     found: dict[str, tuple[CameraSpec, list[MarkedImage]]] = {}
     for image in images:
-        # Label Studio has addresses, and puts eight digits before the name of an uploaded file.
-        place = re.sub(r"(%[0-9A-Fa-f]{2})+", lambda it: _unquote(it[0]), image.name)
-        named = IMAGE_NAME.search(place)
-        stem = named[1] if named else PurePosixPath(place.replace("\\", "/")).stem
+        stem = _stem(image.name)
+        # Label Studio puts eight digits before the name of an uploaded file.
         short = stem if stem in static else re.sub(r"^[0-9a-f]{8}-", "", stem)
         name = owner or known_id(short, static)
         if name not in static or name in found:
@@ -219,8 +218,15 @@ def _assign_images(
     return found
 
 
-def _unquote(text: str) -> str:
-    return bytes.fromhex(text.replace("%", "")).decode(errors="replace")
+def _stem(name: str) -> str:
+    """Return an image's name without folders and ending; Label Studio has addresses."""
+
+    def unquote(found: re.Match[str]) -> str:
+        return bytes.fromhex(found[0].replace("%", "")).decode(errors="replace")
+
+    place = re.sub(r"(%[0-9A-Fa-f]{2})+", unquote, name)
+    named = IMAGE_NAME.search(place)
+    return named[1] if named else PurePosixPath(place.replace("\\", "/")).stem
 
 
 def _records(
@@ -228,15 +234,16 @@ def _records(
 ) -> dict[str, Record]:
     if camera.kind == "static":
         return {clicked_file(owner): labels.markings(owner, images[0])}
-    frames = {}
+    frames: dict[int, ClickedMarkings] = {}
+    numbers = frame_numbers(f"{_stem(image.name)}.png" for image in images)
     for image in images:
-        digits = re.findall(r"\d+", PurePosixPath(image.name).stem)
-        if not digits or int(digits[-1]) in frames:
-            expected = "an image whose name ends in its frame number, such as frame_000084.png"
-            found = "no number" if not digits else f"frame {int(digits[-1])} again"
+        number = numbers.get(f"{_stem(image.name)}.png")
+        if number is None or number in frames:
+            expected = "images whose names have their frame numbers, such as frame_000084.png"
+            found = "no number of one clip" if number is None else f"frame {number} again"
             todo = "Name the images by the frames of the clip's video."
             raise InputError(f"{file}: {image.name}", expected, found, todo)
-        frames[int(digits[-1])] = labels.markings(owner, image)
+        frames[number] = labels.markings(owner, image)
     return {
         key_frames_file(owner): KeyFrames(
             key_frames=tuple(

@@ -15,7 +15,7 @@ from data_contracts.cameras import CameraCalibration, LensCalibration
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec
 from worldpose.errors import InputError
-from worldpose.formats.calibration_files import LeftOut, camera_id
+from worldpose.formats.calibration_files import LeftOut, camera_id, known_id
 from worldpose.formats.calibration_forms import is_of_sensor, read_calibration
 from worldpose.formats.detection_files import json_files
 from worldpose.formats.files import whole_file
@@ -100,6 +100,19 @@ def describe_left_out(left_out: LeftOut) -> list[str]:
             more = f" and {len(names) - 20} more" if len(names) > 20 else ""
             notes.append(f"cameras {', '.join(names[:20])}{more} are left out: {why}")
     return notes
+
+
+def as_cameras(
+    folder: Path, found: Mapping[str, Path], cameras: Collection[str]
+) -> dict[str, Path]:
+    """Return a folder's files by their cameras (`known_id`); InputError for two of one camera."""
+    named: dict[str, Path] = {}
+    for name, file in found.items():
+        if (camera := known_id(name, cameras)) in named:
+            two = f"{named[camera].name} and {file.name}"
+            raise InputError(str(folder), f"one file of {camera}", two, "Keep one of them.")
+        named[camera] = file
+    return named
 
 
 def camera_of(place: Path) -> str:
@@ -189,6 +202,7 @@ def detections_by_camera(
         first = found.setdefault(camera_of(place), place)
         if first != place:
             left_out.notes.append(f"{place.name}: {first.name} is of the same camera; left out")
+    found = as_cameras(folder, found, {*cameras, *left_out})
     endings = (*suffixes, "or a folder of .json")
     return pick_cameras(folder, found, cameras, calibration, endings, left_out)
 
@@ -360,7 +374,8 @@ def import_videos(
             found = without_strays(videos, found, ())
             require_cameras(videos, found)
         states = {file: file_state(file) for file in found.values()}
-        indices = {name: index_video(file) for name, file in found.items()}
+        by_file = {file: index_video(file) for file in found.values()}
+        indices = {name: by_file[file] for name, file in found.items()}
         cameras: dict[str, CameraCalibration] = {}
         notes: list[str] = []
         files = dict(found)
@@ -368,6 +383,7 @@ def import_videos(
             left_out = LeftOut()
             shown = {name: index.size for name, index in indices.items()}
             cameras = read_calibration(calibration, shown, left_out, any_unit=place is not None)
+            found = as_cameras(videos, found, {*cameras, *left_out})
             found = without_strays(videos, found, {*cameras, *left_out})
             is_joined = any(not file.is_relative_to(videos) for file in found.values())
             if found.keys() - left_out.keys() != cameras.keys() and not is_joined:
@@ -375,7 +391,7 @@ def import_videos(
             endings = VIDEO_SUFFIXES
             files = pick_cameras(videos, found, list(cameras), calibration, endings, left_out)
             notes += describe_left_out(left_out)
-            indices = {name: indices[name] for name in files}
+            indices = {name: by_file[file] for name, file in files.items()}
             cameras = {name: cameras[name] for name in files}
             for name, file in files.items():
                 cameras[name] = fit_to_video(

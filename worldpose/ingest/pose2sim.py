@@ -39,6 +39,7 @@ from worldpose.ingest.camera_videos import (
 )
 from worldpose.ingest.importing import (
     Placing,
+    as_cameras,
     build_spec,
     camera_of,
     describe_left_out,
@@ -101,6 +102,8 @@ def import_pose2sim(
     if calibration is not None:
         shown = {name: known[file].size for name, file in films.items()}
         cameras = read_calibration(calibration, shown, left_out, any_unit=place is not None)
+        films = as_cameras(films_in, films, {*cameras, *left_out})
+        places = as_cameras(folder, places, {*cameras, *left_out})
     films = without_strays(films_in, films, {*cameras, *left_out})
     used = set(films.values())
     if calibration is None:

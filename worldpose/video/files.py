@@ -5,6 +5,7 @@ Videos are written from images, or cut from another video without re-encoding.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from fractions import Fraction
 from itertools import chain, dropwhile, islice, pairwise
@@ -45,6 +46,16 @@ def open_file(path: Path, form: str | None = None) -> InputContainer:
             if 16 * pixels > MAX_FRAME_PIXELS:
                 stream.codec_context.thread_count = 2 * MAX_FRAME_PIXELS // pixels
     return container
+
+
+def holds_video(path: Path) -> bool:
+    """Return whether FFmpeg finds a video in a file's content: no image, sound, text or list."""
+    try:
+        with open_file(path) as container:
+            is_other = re.search("_pipe|image2|tty|bin|adf|idf", container.format.name)
+            return not is_other and bool(_films(container))
+    except (InputError, av.error.FFmpegError, OSError):
+        return False
 
 
 def index_frames(path: Path) -> FrameIndex:
@@ -204,15 +215,20 @@ def _require_square(path: Path, stream: VideoStream) -> None:
         )
 
 
-def _require_alone(path: Path, container: InputContainer) -> None:
-    """Raise InputError for a file with videos of several cameras or programmes."""
-    films = [
+def _films(container: InputContainer) -> list[tuple[int, int, int]]:
+    """Return number, width and height of each stream of video that is no picture of a cover."""
+    return [
         (stream.index, stream.width, stream.height)
         for stream in container.streams.video
         if stream.codec_context is not None
         and stream.width * stream.height
         and not stream.disposition & (Disposition.attached_pic | Disposition.timed_thumbnails)
     ]
+
+
+def _require_alone(path: Path, container: InputContainer) -> None:
+    """Raise InputError for a file with videos of several cameras or programmes."""
+    films = _films(container)
     if len(films) > 1:
         found = ", ".join("stream {} of {} x {} px".format(*film) for film in films)
         todo = "Give each as a file of its own: ffmpeg -i IN -map 0:NUMBER -c copy OUT."
@@ -257,8 +273,11 @@ class VideoReader(Pictures):
         self.path = path
         self.index = index_frames(path) if index is None else index
         self._number = {int(stamp): number for number, stamp in enumerate(self.index.stamps)}
-        self._lead = 0
         self._open()
+        # Where several frames are in a packet of a program stream, the first time stamps after a
+        # seek are those of other frames.
+        is_packed = self._container.format.name == "mpeg"
+        self._lead = round(0.5 / self.index.time_base) if is_packed and self.index.time_base else 0
 
     def _open(self) -> None:
         self._container = open_file(self.path)

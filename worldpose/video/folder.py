@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Flags, Image, Integers
 from worldpose.errors import InputError
 from worldpose.video.files import VideoReader, index_frames
+from worldpose.video.names import frame_numbers
 from worldpose.video.pictures import FrameIndex, Pictures
 from worldpose.video.recordings import read_dpx
 
@@ -72,7 +73,7 @@ SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".
 
 
 class ImageFolder(Pictures):
-    """Images whose names end in their number; the lowest is frame 0, a gap a missing frame."""
+    """Images whose names have their number; the lowest is frame 0, a gap a missing frame."""
 
     def __init__(self, folder: Path, index: FrameIndex | None = None) -> None:
         """Open a folder.
@@ -115,32 +116,31 @@ class ImageFolder(Pictures):
 
 
 def numbered_images(folder: Path) -> list[tuple[int, Path]]:
-    """Return the images of a folder by the number at the end of their names.
+    """Return the images of a folder by the numbers at the ends of their names, or else in these.
+
+    `frame_numbers` finds the latter, as in `img (7).png` of Windows.
 
     Raises:
         InputError: no images, or names without a number or with the same one.
     """
-    digits = 18  # 64 bits hold no longer number
     files = sorted(
         file
         for file in folder.iterdir()
         if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")
     )
-    ends = [re.search(r"\d+$", file.stem) for file in files]
-    too_long = next((end.group() for end in ends if end and len(end.group()) > digits), None)
-    if too_long is not None:
-        expected = f"images whose names end in numbers of at most {digits} digits"
-        todo = "Name them in order, for example 000123.jpg."
-        raise InputError(str(folder), expected, too_long, todo)
-    numbers = [int(end.group()) for end in ends if end]
-    if not files or len(set(numbers)) < len(files):
+    ends = [end for file in files if (end := re.fullmatch(r"(.*\D|)(\d{1,18})", file.stem))]
+    if len(ends) == len(files) and len({end[1] for end in ends}) == 1:
+        numbers = {file.name: int(end[2]) for file, end in zip(files, ends, strict=True)}
+    else:
+        numbers = frame_numbers(file.name for file in files)
+    if not files or len(set(numbers.values())) < len(files):
         raise InputError(
             str(folder),
-            expected=f"images ({', '.join(SUFFIXES)}) whose names end in numbers that differ",
-            found=f"{len(files)} images with {len(set(numbers))} numbers",
+            expected=f"images ({', '.join(SUFFIXES)}) of one clip, whose names number them",
+            found=f"{len(files)} images with {len(set(numbers.values()))} numbers",
             todo="Name them in order, for example 000123.jpg.",
         )
-    return sorted(zip(numbers, files, strict=True))
+    return sorted((numbers[file.name], file) for file in files)
 
 
 def index_images(folder: Path) -> FrameIndex:

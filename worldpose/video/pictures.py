@@ -61,7 +61,8 @@ class FrameIndex:
         # The median of the single steps is rounded to the time base; the whole length is not.
         step = np.diff(self.stamps)
         away = np.abs(step - np.median(step))
-        usual = away <= max(1.0, float(away.min()))
+        # Rounding moves a step by one unit; of AVI, two in place of one are a lost frame.
+        usual = away <= max(float(np.median(step) > 1.0), float(away.min()))
         return float(1.0 / (step[usual].mean() * float(self.time_base)))
 
     def on_clock(self, fps: float, where: str) -> Integers:

@@ -12,8 +12,9 @@ from worldpose.errors import InputError
 from worldpose.formats.coco_results import read_coco_results
 from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.formats.keypoint_files import read_people
-from worldpose.formats.keypoint_sets import frame_numbers, order_by_names
+from worldpose.formats.keypoint_sets import order_by_names
 from worldpose.ingest.importing import describe_changes, pose_folders
+from worldpose.video.names import frame_numbers
 
 # A standing person in pixels, 400 px tall, of which each set has some points.
 SIDE = {

@@ -335,7 +335,7 @@ def test_places_depend_on_the_pitch_of_the_venue_and_names_do_not(tmp_path):
         ({"lines": [("touch_line", LINE)]}, None, "touch_line_"),
         ({"size": (960, 540)}, None, "960 x 540"),
         ({"name": "north.png"}, None, "east, west"),
-        ({"name": "still.png"}, "goal", "ends in its frame number"),
+        ({"name": "still.png"}, "goal", "have their frame numbers"),
         ({}, "north", "goal"),
         ({"clicks": []}, None, "no labelled point"),
         ({"clicks": [], "areas": [("adboard", LINE)]}, None, "found 1 polygon of adboard"),

@@ -327,8 +327,9 @@ def test_images_count_by_their_numbers_and_a_gap_is_a_missing_frame(tmp_path):
 @pytest.mark.parametrize(
     ("names", "message"),
     [
-        (["first"], "end in numbers"),
-        (["9" * 40], "at most 18 digits"),
+        (["first"], "whose names number them, found 1 images with 0 numbers"),
+        (["9" * 40], "1 images with 0 numbers"),
+        (["take1_10", "take1_11", "take2_5"], "of one clip, .* found 3 images with 0 numbers"),
         # One odd number does not fill the memory.
         (["0", "2000000000"], "2000000000 frames after the first"),
     ],
