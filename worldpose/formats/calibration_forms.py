@@ -421,9 +421,9 @@ OPENCAP: Final = Form(
 EASYMOCAP: Final = Form("EasyMocap", ("intri.yml", "extri.yml"), "m, z up", _read_easymocap)
 BIOCV: Final = Form("bioCV", (".calib",), "mm, z up", lambda files, *_: _read_biocv(files))
 JSON: Final = Form(
-    "Panoptic Studio, multical",
+    "Panoptic Studio, multical, K R t",
     (".json",),
-    "cm, y down; multical: m, first camera",
+    "cm, y down; multical: m, first camera; K R t: m, z up",
     lambda files, _, left_out: read_camera_json(files[0], left_out),
 )
 KALIBR: Final = Form(

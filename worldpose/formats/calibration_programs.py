@@ -34,16 +34,24 @@ _CENTIMETRE: Final = 1e-2
 
 
 def read_camera_json(path: Path, left_out: LeftOut | None) -> dict[str, CameraCalibration]:
-    """Return the cameras of Panoptic Studio or multical by name; InputError if it is of neither."""
+    """Return the cameras of Panoptic Studio, multical or a plain mapping by name; or InputError.
+
+    A plain mapping has `K`, `R`, `t` [m], `dist` and `image_size` of each camera, as OpenCV's.
+    """
     content = read_json(path, _JSON_BYTES)
     cameras = content.get("cameras") if isinstance(content, dict) else None
     if isinstance(cameras, list) and all(isinstance(one, dict) for one in cameras):
         return _read_panoptic(path, cameras, left_out)
     if isinstance(cameras, dict) and all(isinstance(one, dict) for one in cameras.values()):
         return _read_multical(path, cameras, content.get("camera_poses"), left_out)
+    if isinstance(content, dict) and cameras is None and content:
+        tables = {name: one for name, one in content.items() if isinstance(one, dict)}
+        if len(tables) == len(content) and all("K" in one for one in tables.values()):
+            keys = Keys("image_size", "K", "dist", "R", "t")
+            return _read_tables(path, tables, keys, left_out)
     raise calibration_error(
         f"{path}: cameras",
-        "Panoptic Studio's list of cameras, or multical's mapping",
+        "Panoptic Studio's list of cameras, multical's mapping, or K, R and t of each camera",
         "nothing" if cameras is None else f"{cameras!r:.60}",
     )
 

@@ -231,6 +231,18 @@ def write_multical(folder, cameras):
     return path
 
 
+def write_plain(folder, cameras):
+    """Write OpenCV's numbers of each camera, as many scripts of researchers do."""
+    tables = {
+        one.id: {"K": matrix(one).tolist(), "R": one.rotation, "t": one.translation}
+        | {"dist": one.distortion, "image_size": SIZE}
+        for one in cameras
+    }
+    path = folder / "calibration.json"
+    path.write_text(json.dumps(tables))
+    return path
+
+
 def write_kalibr(folder, cameras, model="radtan"):
     """Write a camchain, whose world is that of the first camera."""
     lines, before = [], None
@@ -268,4 +280,5 @@ WRITERS = {
     "FreeMoCap": write_freemocap,
     "Panoptic": write_panoptic,
     "multical": write_multical,
+    "K R t": write_plain,
 }
