@@ -12,6 +12,7 @@ import codecs
 import csv
 import gzip
 import io
+import lzma
 import math
 import re
 import zipfile
@@ -168,7 +169,7 @@ def read_cells(path: Path, limit: int, todo: str) -> tuple[list[tuple[int, list[
             raise ValueError("something else" if path.exists() else "nothing")
         if path.stat().st_size > limit:
             raise ValueError(f"{path.stat().st_size} bytes, more than {limit}")
-        lines = decode_table(path.read_bytes()).splitlines()
+        lines = decode_table(path.read_bytes(), limit).splitlines()
         hint = re.fullmatch(r"sep=(.)\W*", lines[0]) if lines else None  # of Excel
         if hint is not None:
             lines[0] = ""
@@ -198,14 +199,13 @@ def read_cells(path: Path, limit: int, todo: str) -> tuple[list[tuple[int, list[
     return rows, has_commas
 
 
-def _unpack(content: bytes) -> bytes:
+def _unpack(content: bytes, most: int) -> bytes:
     """Return the only file of a zip archive, or that of gzip; other bytes as they are."""
-    most = 1 << 30
     try:
         if content.startswith(b"\x1f\x8b"):
             with gzip.open(io.BytesIO(content)) as packed:
                 content = packed.read(most + 1)
-        elif content.startswith(b"PK"):
+        elif content.startswith(b"PK\x03\x04"):
             with zipfile.ZipFile(io.BytesIO(content)) as archive:
                 names = [
                     n for n in archive.namelist() if not re.search(r"/$|(^|/)(\.|__MACOSX/)", n)
@@ -217,16 +217,16 @@ def _unpack(content: bytes) -> bytes:
                     raise ValueError(f"an archive of {found}: give one of them")
                 with archive.open(names[0]) as file:
                     content = file.read(most + 1)
-    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
+    except (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, RuntimeError) as error:
         raise ValueError(f"a damaged or locked archive: {error}") from error
     if len(content) > most:
         raise ValueError(f"an archive of more than {most} bytes")
     return content
 
 
-def decode_table(content: bytes) -> str:
-    """Return the text of a table, perhaps the only one in an archive."""
-    content = _unpack(content)
+def decode_table(content: bytes, most: int = 1 << 30) -> str:
+    """Return the text of a table of at most so many bytes, perhaps the only one in an archive."""
+    content = _unpack(content, most)
     if content.startswith(b"\xd0\xcf\x11\xe0"):
         raise ValueError("a workbook, not text: save it as CSV")
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):

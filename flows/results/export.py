@@ -369,7 +369,10 @@ def _export(origin: best_results.Origin, forms: list[str], out: Path) -> list[Pa
     """
     require_formats(forms, origin.stage)
     of_people = [form for form in forms if form not in (*POSITION_FORMATS, *OF_CAMERAS)]
-    has = not of_people or any(np.isfinite(origin.tracks(c).joints).any() for c in origin.clips)
+    # Other formats need a body, of which these joints are.
+    of_bodies = partial(best_results.joint_tracks, origin.run)
+    joints_of = origin.tracks if OF_JOINTS.issuperset(of_people) else of_bodies
+    has = not of_people or any(np.isfinite(joints_of(clip).joints).any() for clip in origin.clips)
     chosen = dict.fromkeys(forms if has else ())
     written = [path for form in chosen for path in EXPORTS[form](origin, out)]
     if not written:

@@ -154,7 +154,7 @@ def build(
         # No paths of this machine, no options of commands.
         notes = [re.sub(r"; --\w+ states another", "", it.replace(f"{given}/", "")) for it in taken]
         match = read_match(folder, (), *pitch_in_words(store, folder, read_spec(folder)))
-        if match_id is None:  # else 2D poses of hours would be read anew at each change
+        if match_id is None or taken:  # else 2D poses of hours would be read at each change
             notes += uncovered_clips(match)
     except InputError as error:
         return [describe(error, folder, given)], notes

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import re
 import warnings
-import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,6 +48,8 @@ def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float
             time = each["timestamp"]
             if is_text := not pd.api.types.is_numeric_dtype(time):
                 seconds = time.map(clock_seconds)
+                spans = pd.to_timedelta(time, errors="coerce").dt.total_seconds()  # 40ms, PT0.04S
+                seconds = seconds.where(seconds.notna(), spans)
                 if (odd := time[seconds.isna() & time.notna()]).size:
                     raise ValueError(
                         f"the time {odd.iloc[0]!r:.40}, neither 00:01:02.5 nor seconds"
@@ -86,7 +87,7 @@ def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float
         if not 1.5 < reach < 200.0 or not table.index.is_unique:
             raise ValueError(f"{len(names)} people at places up to {reach:g} in {len(x)} rows")
         return table.index.to_numpy(np.int64), names, np.stack([x, y], axis=-1), rate
-    except (OSError, EOFError, zlib.error, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError) as error:
         raise InputError(
             str(path),
             expected="frame_id, each once, and places of people in metres from the centre spot",

@@ -70,11 +70,11 @@ def read_coco_results(path: Path) -> PeopleFile:
     batches, foreign = [], 0
     posed, pointless_of = set[str](), list[str]()  # categories with points, and of entries without
     for first, results in _batches(path, entries):
-        if items.is_mapping:
-            for each in results:
-                given = each.get("keypoints")
+        for each in results:
+            given = each.get("keypoints")
+            is_empty = not given or (isinstance(given, list) and not any(given))
+            if items.is_mapping or is_empty:
                 is_other = categories.are_other(given, each.get("category_id"))
-                is_empty = not given or (isinstance(given, list) and not any(given))
                 if is_other or (is_empty and each.get("iscrowd") == 1):  # one box of many people
                     each.update(keypoints=None, bbox=None, box=None)
                     foreign += is_other
@@ -98,11 +98,11 @@ def read_coco_results(path: Path) -> PeopleFile:
         raise InputError(f"{path}: annotations", "keypoints of people", there, todo)
     found = _join(path, batches)
     points = found.points
-    if items.is_mapping:
-        posed.discard("None")
+    posed.discard("None")
     # A box alone is a person's if others of its category have points; a ball has another one.
     alone = np.flatnonzero(found.lacks)
-    found.boxes[alone[np.array([each not in posed for each in pointless_of], bool)]] = np.nan
+    other = np.array([each not in posed for each in pointless_of], bool)
+    found.boxes[alone[other | ~np.all(found.boxes[alone, 2:] > 0.0, axis=1)]] = np.nan
     pointless = int(np.isnan(found.boxes[alone]).any(axis=1).sum())
     if items.is_mapping and np.isin(np.nan_to_num(points[..., 2]), (0, 1, 2)).all():
         points[..., 2] = np.minimum(points[..., 2], 1)  # visibility: 1 occluded, 2 visible

@@ -87,9 +87,11 @@ def without_strays(
 def _films_in(folder: Path) -> list[Path]:
     """Return the videos of a folder by their endings; if none has one, by their content."""
     most = 200  # files whose content is looked at: cameras are fewer
-    files = [file for file in sorted(folder.glob("[!.]*")) if file.is_file()]
-    named = [*filter(is_video, files)]
-    return named if named or len(files) > most else [*filter(holds_video, files)]
+    files = [file for file in sorted(folder.glob("[!.]*")) if not file.is_dir()]
+    named = [*filter(is_video, files)]  # with links to a disk that is away, which is told later
+    if named or len(files) > most:
+        return named
+    return [file for file in files if file.is_file() and holds_video(file)]
 
 
 def _recordings_in(place: Path) -> list[list[Path]]:

@@ -235,7 +235,7 @@ def _records(
     if camera.kind == "static":
         return {clicked_file(owner): labels.markings(owner, images[0])}
     frames: dict[int, ClickedMarkings] = {}
-    numbers = frame_numbers(f"{_stem(image.name)}.png" for image in images)
+    numbers = frame_numbers((f"{_stem(image.name)}.png" for image in images), ends=True)
     for image in images:
         number = numbers.get(f"{_stem(image.name)}.png")
         if number is None or number in frames:

@@ -51,8 +51,12 @@ def open_file(path: Path, form: str | None = None) -> InputContainer:
 def holds_video(path: Path) -> bool:
     """Return whether FFmpeg finds a video in a file's content: no image, sound, text or list."""
     try:
+        with path.open("rb") as file:
+            if file.read(7) == b"#EXTM3U":  # FFmpeg waits for the rest of a live list
+                return False
         with open_file(path) as container:
-            is_other = re.search("_pipe|image2|tty|bin|adf|idf", container.format.name)
+            others = "_pipe|image2|tty|bin|adf|idf|gif|ico|fits"
+            is_other = re.search(others, container.format.name)
             return not is_other and bool(_films(container))
     except (InputError, av.error.FFmpegError, OSError):
         return False

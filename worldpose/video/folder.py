@@ -132,7 +132,7 @@ def numbered_images(folder: Path) -> list[tuple[int, Path]]:
     if len(ends) == len(files) and len({end[1] for end in ends}) == 1:
         numbers = {file.name: int(end[2]) for file, end in zip(files, ends, strict=True)}
     else:
-        numbers = frame_numbers(file.name for file in files)
+        numbers = frame_numbers((file.name for file in files), ends=True)
     if not files or len(set(numbers.values())) < len(files):
         raise InputError(
             str(folder),

@@ -24,7 +24,7 @@ def is_video(path: str | PurePath) -> bool:
     return PurePath(path).suffix.lower() in VIDEO_SUFFIXES
 
 
-def frame_numbers(names: Iterable[str]) -> dict[str, int]:
+def frame_numbers(names: Iterable[str], *, ends: bool = False) -> dict[str, int]:
     """Return the frame in each name of a picture or its file; those without a number are left out.
 
     It is the number that differs from name to name and can be a frame: of `000012_cam1.png` and
@@ -33,6 +33,8 @@ def frame_numbers(names: Iterable[str]) -> dict[str, int]:
     The number of a camera or clip, as in `cam1`, counts in names without another. Roboflow puts a
     digest after the name: `frame_12_jpg.rf.3fa9`. In addresses, %20 stands for a space. A copy,
     `frame_12 (1)` or `frame_12 2` beside `frame_12`, has the number of that.
+
+    With `ends`, it is the last number wherever that can be, as of key frames, which are far apart.
 
     The numbers of names without such a place are their last ones. So they are if the last one is
     the same in all names and a single other one differs: that may be the camera's or the clip's.
@@ -55,7 +57,7 @@ def frame_numbers(names: Iterable[str]) -> dict[str, int]:
     differing = [place for place, there in values.items() if len(there) > 1]
     distinct = [p for p in values if len(values[p]) == len(found) and max(values[p]) <= FRAME_LIMIT]
     chosen = min(distinct, key=lambda p: max(values[p]) - min(values[p]), default=1)
-    if 1 not in differing and len(differing) == 1:
+    if (ends and 1 in distinct) or (1 not in differing and len(differing) == 1):
         chosen = 1
     rows = sorted((numbers[-chosen], numbers[-count:-chosen]) for numbers in found.values())
     before = [part for _, part in rows]

@@ -61,8 +61,10 @@ class FrameIndex:
         # The median of the single steps is rounded to the time base; the whole length is not.
         step = np.diff(self.stamps)
         away = np.abs(step - np.median(step))
-        # Rounding moves a step by one unit; of AVI, two in place of one are a lost frame.
-        usual = away <= max(float(np.median(step) > 1.0), float(away.min()))
+        # Rounding moves a step by one unit; of AVI, two in place of one are a lost frame, as its
+        # unit is the time of a frame and not of a clock.
+        is_rounded = np.median(step) > 1.0 or self.time_base < 0.002
+        usual = away <= max(float(is_rounded), float(away.min()))
         return float(1.0 / (step[usual].mean() * float(self.time_base)))
 
     def on_clock(self, fps: float, where: str) -> Integers:

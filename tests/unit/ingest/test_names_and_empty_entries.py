@@ -20,8 +20,9 @@ from worldpose.ingest.camera_videos import describe_unused, find_videos
 from worldpose.ingest.clicks import import_clicks
 from worldpose.ingest.importing import import_match, import_videos
 from worldpose.ingest.match_folder import read_match
-from worldpose.video.files import VideoReader
-from worldpose.video.folder import open_video
+from worldpose.parsing import read_cells
+from worldpose.video.files import VideoReader, holds_video
+from worldpose.video.folder import numbered_images, open_video
 from worldpose.video.names import frame_numbers
 
 SIZE = (48, 64)
@@ -66,6 +67,21 @@ def test_key_frames_have_the_numbers_in_their_names(tmp_path, form):
     assert [each["frame"] for each in content["key_frames"]] == [7, 12]
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        {"half1_000084": 84, "half2_000310": 310},
+        {"00-15-30_22950": 22950, "00-16-10_23950": 23950},
+        {"00001_frame000005": 5, "00002_frame000010": 10, "00003_frame000015": 15},
+    ],
+)
+def test_the_last_number_counts_where_it_can_be_a_frame(tmp_path, names):
+    for name in names:
+        cv2.imwrite(str(tmp_path / f"{name}.png"), level(1))
+    found = {file.stem: number for number, file in numbered_images(tmp_path)}
+    assert found == frame_numbers(names, ends=True) == names
+
+
 def test_an_escaped_space_is_no_digit_of_a_frame():
     assert frame_numbers(["a%2012.jpg", "a%2013.jpg"]) == {"a%2012.jpg": 12, "a%2013.jpg": 13}
 
@@ -99,13 +115,17 @@ def boxed(frame, **more):
 def test_a_person_with_a_box_alone_stays_one_and_a_ball_is_none(tmp_path, nothing):
     people = [boxed(3, keypoints=POINTS), boxed(4, **nothing)]
     ball = {**boxed(5, **nothing), "category_id": 37}
+    unnamed, flat = {**boxed(5, **nothing)}, boxed(6, **nothing, iscrowd=1)
+    del unnamed["category_id"]
     (tmp_path / "a.json").write_text(json.dumps([*people, ball]))
+    (tmp_path / "d.json").write_text(json.dumps([*people, unnamed]))
+    (tmp_path / "e.json").write_text(json.dumps([*people, flat]))
     category = {"id": 1, "name": "person", "keypoints": list(COCO17)}
     crowd = boxed(6, keypoints=[0] * 51, iscrowd=1)
     content = {"annotations": [*people, ball], "categories": [category, {"id": 37, "name": "ball"}]}
     (tmp_path / "c.json").write_text(json.dumps(content | {"annotations": [*people, crowd]}))
     (tmp_path / "b.json").write_text(json.dumps(content))
-    for file in ("a.json", "b.json", "c.json"):
+    for file in ("a.json", "b.json", "c.json", "d.json", "e.json"):
         found = read_coco_results(tmp_path / file)
         assert found.people.frame.tolist() == [3, 4]
         np.testing.assert_array_equal(found.people.boxes[1, 0], [10, 20, 40, 60])
@@ -185,6 +205,8 @@ def test_times_of_positions_may_have_a_decimal_comma(tmp_path, form, sign):
 
 
 def test_times_that_are_none_are_refused(tmp_path):
+    (tmp_path / "b.csv").write_text(table(f"{40 * n}ms" for n in range(5)))
+    assert read_positions(tmp_path / "b.csv")[3] == pytest.approx(25.0)
     (tmp_path / "a.csv").write_text(table(["half past"] * 3))
     with pytest.raises(InputError, match="the time 'half past', neither"):
         read_positions(tmp_path / "a.csv")
@@ -209,6 +231,11 @@ def test_positions_may_be_in_an_archive(tmp_path):
     for content in packed:
         (tmp_path / "a.zip").write_bytes(content)
         np.testing.assert_array_equal(read_positions(tmp_path / "a.zip")[2], wanted)
+    (tmp_path / "a.zip").write_bytes(gzip.compress(b"a,b\n" * 9999))
+    with pytest.raises(InputError, match="more than 999 bytes"):
+        read_cells(tmp_path / "a.zip", 999, "")
+    (tmp_path / "a.csv").write_text("PKEY,b\n1,2\n")
+    assert read_cells(tmp_path / "a.csv", 999, "")[0][0][1] == ["PKEY", "b"]
     for content, said in (
         (archive(**{"a.csv": text, "b.csv": text}), "2 files, a.csv, b.csv: give one"),
         (archive(**{"[Content_Types].xml": "", "xl/a.xml": ""}), "a workbook, not text"),
@@ -262,6 +289,15 @@ def test_content_tells_a_video_only_where_no_name_does(tmp_path):
         encode(tmp_path / name, "mp4", "mpeg4", "yuv420p")
     assert [*find_videos(tmp_path)] == ["GX010017"]
     assert "GL010017.LRV" in str(describe_unused(tmp_path, ()))
+
+
+def test_pictures_and_lists_are_no_videos_and_a_link_to_nothing_is_told(tmp_path):
+    encode(tmp_path / "preview.gif", "gif", "gif", "rgb8")
+    (tmp_path / "live.m3u8").write_text("#EXTM3U\n#EXTINF:6,\nhttp://127.0.0.1:9/a.ts\n")
+    assert not any(map(holds_video, tmp_path.iterdir()))
+    encode(tmp_path / "a.mp4", "mp4", "mpeg4", "yuv420p")
+    (tmp_path / "b.mp4").symlink_to(tmp_path / "unmounted.mp4")
+    assert [file.stem for file in find_videos(tmp_path).values()] == ["a", "b"]
 
 
 def test_frames_of_a_program_stream_are_found_by_number_where_a_packet_has_several(tmp_path):
