@@ -238,7 +238,8 @@ def refine(
     weights = Weights(
         flow_deviation_px=deviation,
         flow_share=share,
-        smooth_log_focal=_finite_or_zero(spread[3]),
+        # 0 means none: a record cannot hold infinity.
+        smooth_log_focal=float(spread[3]) if np.isfinite(spread[3]) else 0.0,
         smooth_frames=lasting,
         player_share=noise.share,
         player_frames=noise.frames,
@@ -412,8 +413,3 @@ def _keep_frames(clip: BroadcastClip, wanted: set[int], kept: dict[int, Image]) 
             found=f"{count} pictures, and data of {', '.join(map(str, sorted(given)))}",
             todo="Give rows for all pictures, NaN where nothing is known.",
         )
-
-
-def _finite_or_zero(value: float) -> float:
-    """Return a spread for a record, which cannot hold infinity: 0 means none."""
-    return float(value) if np.isfinite(value) else 0.0
