@@ -363,9 +363,9 @@ def _turn_rows(
     unturned = replace(camera, cam_from_world=Rigid.identity())
     for part in np.unique(share[share > 0.0]):
         rows, motion = pixels[share == part], _view_motion(camera, part * amount)
-        motion = np.linalg.inv(motion) if back else motion
+        turn = np.linalg.inv(motion) if back else motion
         plane = camera.normalize(rows.reshape(-1, 2))
-        rays = np.concatenate([plane, np.ones((len(plane), 1))], axis=1) @ motion.T
+        rays = np.concatenate([plane, np.ones((len(plane), 1))], axis=1) @ turn.T
         pixels[share == part] = unturned.project(rays).reshape(rows.shape)
 
 
