@@ -34,7 +34,8 @@ from worldpose.simulation.renderer import render_pitch
 from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.from_paint.paint import Ridges, guess_lens, straighten_paint
 from worldpose.static_calibration.from_paint.proposal import (
-    calibrate_without_clicks,
+    calibrate_proposal,
+    propose_camera,
     propose_from_paint,
 )
 from worldpose.static_calibration.report import StaticCalibration
@@ -341,7 +342,8 @@ def simulate_stills(scenario: str, seeds: range) -> Iterator[Outcome]:
             start = time.process_time()
             label = f"{scenario} {seed} {name}"
             try:
-                found = calibrate_without_clicks(pitch, still, side=side_of(true, pitch))
+                proposal = propose_camera(still, pitch, side=side_of(true, pitch))
+                found = calibrate_proposal(pitch, proposal, still)
             except InputError as refused:
                 seconds = time.process_time() - start
                 yield Outcome(label, False, np.nan, seconds, refused.found)

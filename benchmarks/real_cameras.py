@@ -36,7 +36,7 @@ from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.ingest.validation import validate_record
 from worldpose.pitch.template import PitchTemplate
-from worldpose.static_calibration.from_paint.proposal import calibrate_without_clicks
+from worldpose.static_calibration.from_paint.proposal import calibrate_proposal, propose_camera
 from worldpose.static_calibration.sides import turn_camera
 from worldpose.video.folder import open_video
 
@@ -221,7 +221,7 @@ def score_still(picture: Image, still: Mapping[str, Any]) -> Score:
     """Return the score of one still, and write an overlay."""
     pitch, start = PitchTemplate.standard(), time.perf_counter()
     try:
-        found = calibrate_without_clicks(pitch, picture, side="near")
+        found = calibrate_proposal(pitch, propose_camera(picture, pitch, side="near"), picture)
     except InputError as refused:
         seconds = time.perf_counter() - start
         return Score(False, np.zeros(len(PIXELS)), False, seconds, refused.found)

@@ -31,9 +31,7 @@ from worldpose.static_calibration.report import (
     StaticCalibration,
     calibration_arrays,
     calibration_attributes,
-    calibration_coordinates,
-    given_attributes,
-    left_out_attributes,
+    uncalibrated_attributes,
 )
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 from worldpose.static_calibration.sides import SeenPeople, decide_sides
@@ -56,7 +54,7 @@ def static_calibration(inputs: UnitInputs, result: ResultWriter) -> None:
         result.write(
             STATIC_CALIBRATION,
             arrays=camera_arrays(camera),
-            attributes=given_attributes(inputs.unit),
+            attributes=uncalibrated_attributes(inputs.unit, "given"),
         )
         result.warnings += [said] if (said := camera.describe_fold(inputs.unit)) else []
         return
@@ -64,14 +62,15 @@ def static_calibration(inputs: UnitInputs, result: ResultWriter) -> None:
         calibration = _calibrate(inputs)
     except InputError as error:  # a failed calibration of one camera must not end the match
         reason = str(error)
-        attributes = left_out_attributes(inputs.unit, reason)
+        attributes = uncalibrated_attributes(inputs.unit, "none", reason)
         result.write(STATIC_CALIBRATION, arrays={}, attributes=attributes)
         result.left_out[inputs.unit] = reason
         return
+    known = calibration.report.ground_error
     result.write(
         STATIC_CALIBRATION,
         arrays=calibration_arrays(calibration),
-        coordinates=calibration_coordinates(calibration),
+        coordinates={"ground_x": known.x, "ground_y": known.y},
         attributes=calibration_attributes(inputs.unit, calibration),
     )
     result.figures.update(_figures(calibration.report))

@@ -192,10 +192,6 @@ def _view_tensor(storage: object, first: int, lengths: Any, steps: Any, *_: obje
     return np.lib.stride_tricks.as_strided(part, list(lengths), strides).copy()
 
 
-def _sparse(form: Any) -> type[_Sparse]:  # noqa: ANN401
-    return type("_Sparse", (_Sparse,), {"form": form})
-
-
 ALLOWED: Final[Mapping[tuple[str, str], Any]] = {
     ("numpy", "ndarray"): _ignore,
     ("numpy", "dtype"): _Dtype,
@@ -225,7 +221,7 @@ ALLOWED: Final[Mapping[tuple[str, str], Any]] = {
         )
     },
     **{
-        (f"scipy.sparse.{module}", f"{form}_matrix"): _sparse(kind)
+        (f"scipy.sparse.{module}", f"{form}_matrix"): type("_Sparse", (_Sparse,), {"form": kind})
         for form, kind in (("csc", scipy.sparse.csc_array), ("csr", scipy.sparse.csr_array))
         for module in (form, f"_{form}")
     },

@@ -82,7 +82,7 @@ def broadcast_pictures(run: Run, match: Match, clip: str | None = None) -> list[
         pictures += flow_pictures(run, match, view, camera)
         for video_number in result.attrs["pick_next"][:WORST_FRAMES]:
             # An image between two match frames has no camera: the nearest one that has is drawn.
-            place = clock.nearest_frame(video_number)
+            place = int(np.abs(clock.number - video_number).argmin())
             number, video_number = int(frame[place]), int(clock.number[place])
             still = _picture(match, view, number)
             pictures.append(

@@ -36,11 +36,8 @@ from flows.results.tool_exports import (
 from worldpose.dataset import manifest as manifests
 from worldpose.errors import InputError, UsageError, unknown_name
 from worldpose.formats import challenge
-from worldpose.formats.baselines.result import (
-    write_baseline_settings,
-    write_slahmr_cameras,
-    write_tracks,
-)
+from worldpose.formats.baselines.result import write_slahmr_cameras, write_tracks
+from worldpose.formats.files import whole_file
 from worldpose.formats.joints_file import write_joints, write_poses
 from worldpose.formats.release_cameras import write_moving_camera, write_static_camera
 from worldpose.formats.tables import write_positions
@@ -198,7 +195,8 @@ def export_slahmr_cameras(origin: best_results.Origin, out: Path) -> Iterator[Pa
 
 def _write_baseline_settings(out: Path) -> Path:
     path = out / "baseline_settings.json"
-    write_baseline_settings(path, BaselineSettings())
+    with whole_file(path) as draft:
+        draft.write_text(BaselineSettings().model_dump_json(indent=2) + "\n", encoding="utf-8")
     return path
 
 

@@ -20,7 +20,7 @@ from worldpose.geometry.lens_fit import fit_lens
 from worldpose.geometry.lens_models import LensModel
 from worldpose.geometry.rigid import Rigid
 from worldpose.pitch.template import PitchTemplate
-from worldpose.static_calibration.from_paint.proposal import calibrate_without_clicks
+from worldpose.static_calibration.from_paint.proposal import calibrate_proposal, propose_camera
 
 DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent")) / "sskit"
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="no still of Spiideo/sskit")
@@ -81,7 +81,8 @@ def test_calibration_without_clicks_places_feet_or_is_refused(lens):
     picture = cv2.cvtColor(cv2.imread(str(DATA / "rgb.jpg")), cv2.COLOR_BGR2RGB)
     pitch = PitchTemplate.from_spec(PitchSpec(length=101.64, width=65.86))
     try:
-        found = calibrate_without_clicks(pitch, picture, side="near", lens=given)
+        proposal = propose_camera(picture, pitch, side="near", lens=given)
+        found = calibrate_proposal(pitch, proposal, picture, lens=given)
     except InputError as error:
         assert "expected one camera that explains the paint" in str(error)
         return

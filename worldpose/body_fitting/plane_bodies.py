@@ -108,11 +108,7 @@ class PlaneBodies:
 
 
 def fit_bodies_on_plane(
-    model: BodyModel,
-    evidence: PlaneEvidence,
-    estimates: MonocularEstimates,
-    ground: Ground,
-    settings: BodyFittingSettings = BodyFittingSettings(),  # noqa: B008
+    model: BodyModel, evidence: PlaneEvidence, estimates: MonocularEstimates, ground: Ground
 ) -> PlaneBodies:
     """Return the bodies of people that one camera alone sees without triangulation.
 
@@ -121,7 +117,7 @@ def fit_bodies_on_plane(
     """
     frames, persons = evidence.place.shape[:2]
     # Gauss-Newton steps: a start from monocular poses is farther away than one from joints.
-    settings = settings.model_copy(update={"steps": max(settings.steps, 10)})
+    settings = BodyFittingSettings(steps=10)
     keypoints = fold_keypoints(model, COCO17)
     solver = PoseSolver(ChainedKeypoints.of(keypoints), load_pose_prior(), settings, ground)
     lifted = _lift_keypoints(evidence)

@@ -238,7 +238,8 @@ def refine(
     weights = Weights(
         flow_deviation_px=deviation,
         flow_share=share,
-        smooth_log_focal=_finite_or_zero(spread[3]),
+        # 0 means none: a record cannot hold infinity.
+        smooth_log_focal=float(spread[3]) if np.isfinite(spread[3]) else 0.0,
         smooth_frames=lasting,
         player_share=noise.share,
         player_frames=noise.frames,
@@ -272,12 +273,26 @@ def _refit_as_paper(
     problem: ClipProblem,
     settings: BroadcastCalibrationSettings,
 ) -> ClipSolution:
-    require_torch()
-    from worldpose.broadcast_calibration.paper_variant import refit
+    """Return the camera of least E_calib, the fit with `method=paper`.
 
-    start, count = tracked.chain.camera, settings.line_samples
-    camera = refit(start, pitch, players, count, settings.adam_iterations)
-    return ClipSolution.at(camera, np.zeros((problem.paint_count, 3)), problem)
+    It starts from tracking, whose projections are the markings' initial positions.
+    """
+    require_torch()
+    from worldpose.reference_method.broadcast_calibration import refine
+
+    start, lines = tracked.chain.camera, pitch.sample_lines(0.5).points_world
+    camera = start.camera
+    pixels = camera.project(np.broadcast_to(lines, (len(start), *lines.shape)))
+    seen = ((pixels >= 0.0) & (pixels <= start.image_size - 1.0)).all(axis=-1)
+    frame, point = np.nonzero(seen)
+    # Evenly chosen among those of a frame.
+    place = np.arange(len(frame)) - np.searchsorted(frame, frame)
+    kept = place % np.maximum(1, -(-seen.sum(axis=1) // settings.line_samples))[frame] == 0
+    frame, point = frame[kept], point[kept]
+    field = lines[point], pixels[frame, point], frame
+    people = players.world, players.image, players.frame
+    found = MovingCamera.from_batch(refine(camera, field, people, settings.adam_iterations))
+    return ClipSolution.at(found, np.zeros((problem.paint_count, 3)), problem)
 
 
 def _report_given(
@@ -398,8 +413,3 @@ def _keep_frames(clip: BroadcastClip, wanted: set[int], kept: dict[int, Image]) 
             found=f"{count} pictures, and data of {', '.join(map(str, sorted(given)))}",
             todo="Give rows for all pictures, NaN where nothing is known.",
         )
-
-
-def _finite_or_zero(value: float) -> float:
-    """Return a spread for a record, which cannot hold infinity: 0 means none."""
-    return float(value) if np.isfinite(value) else 0.0

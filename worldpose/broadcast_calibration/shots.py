@@ -181,21 +181,18 @@ def _shot(course: _Course, before: int | None, after: int | None, fps: float, st
     return Shot(course.first, count, seconds, grass, tallest, pan, tuple(course.pictures), unfit)
 
 
-def find_cuts(followed: Sequence[Followed], share: float) -> list[int]:
-    """Return the first frames of new shots, where less than a share of points is followed."""
-    return [number + 1 for number, pair in enumerate(followed) if pair.inlier_share < share]
-
-
 def require_one_shot(
     followed: Sequence[Followed], share: float, where: str, first: int = 0
 ) -> None:
-    """Raise InputError if a clip has several shots; see `find_cuts`.
+    """Raise InputError if a clip has several shots.
+
+    A new one begins where less than a share of points is followed.
 
     Raises:
         InputError: the clip has cuts; the message lists their frames, by their numbers in the
             video.
     """
-    cuts = find_cuts(followed, share)
+    cuts = [number + 1 for number, pair in enumerate(followed) if pair.inlier_share < share]
     if cuts:
         shown = ", ".join(str(first + cut) for cut in cuts[:10]) + (
             " and more" if len(cuts) > 10 else ""

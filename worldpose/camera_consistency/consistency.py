@@ -15,11 +15,11 @@ from worldpose.camera_consistency.comparison import MIN_JOINTS, Comparison
 from worldpose.camera_consistency.diagnosis import Consistency, Diagnosis, Fault
 from worldpose.camera_consistency.hypotheses import OFF_AXIS
 from worldpose.camera_consistency.settings import ConsistencySettings
-from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.ingest.clock import offset_change
 from worldpose.static_calibration.parameters import project_with_jacobian
 from worldpose.tracking.diagnosis import match_pair, usable_rays
+from worldpose.tracking.ray_matching import require_clip
 
 
 def check_consistency(
@@ -53,15 +53,8 @@ def check_consistency(
     """
     min_focal_error = 0.03  # of the logarithm
     given_tilt = 0.003  # largest plausible rotation error of a given camera [rad]
+    require_clip("camera consistency", cameras, detections)
     keypoints, confidence = detections.keypoints, detections.confidence
-    if keypoints.shape != (*confidence.shape, 2) or cameras.batch_shape != confidence.shape[1:2]:
-        raise InputError(
-            "camera consistency",
-            expected="keypoints (frames, cameras, detections, joints, 2), confidence without the "
-            "last, cameras (cameras,)",
-            found=f"{keypoints.shape}, {confidence.shape}, {cameras.batch_shape}",
-            todo="Give arrays of the same clip and cameras.",
-        )
     count = int(cameras.batch_shape[0])
     part = select_busiest_frames(confidence, settings.max_chunk_frames)
     points = np.array(keypoints[part], dtype=np.float64)

@@ -23,7 +23,6 @@ from worldpose.camera_consistency.hypotheses import (
     lens_hypotheses,
     pose_hypotheses,
     rotate_camera,
-    scale_focal_length,
 )
 from worldpose.compiled import map_in_threads
 from worldpose.geometry.cameras import Camera
@@ -444,6 +443,5 @@ class Diagnosis:
 def focal_lengths(camera: Camera, around: float, reach: float, steps: int) -> Iterator[Hypothesis]:
     """Yield focal lengths around `around` times the stated one, in logarithmic steps."""
     for ratio in around * np.exp(np.linspace(-reach, reach, 2 * steps + 1)):
-        yield Hypothesis(
-            "focal", "", scale_focal_length(camera, float(ratio)), value=float(1.0 / ratio)
-        )
+        scaled = replace(camera, focal=camera.focal * float(ratio))
+        yield Hypothesis("focal", "", scaled, value=float(1.0 / ratio))

@@ -80,11 +80,6 @@ def replace_pose(camera: Camera, rotation: Floats, translation: Floats) -> Camer
     return replace(camera, cam_from_world=Rigid(rotation, translation))
 
 
-def scale_focal_length(camera: Camera, ratio: float) -> Camera:
-    """Return the camera with its focal length times `ratio`."""
-    return replace(camera, focal=camera.focal * ratio)
-
-
 def rotate_camera(camera: Camera, rotvec: Floats) -> Camera:
     """Return the camera rotated about its own centre by a rotation vector [rad] of its axes."""
     rotation = Rotation.from_rotvec(rotvec).as_matrix() @ camera.cam_from_world.rotation

@@ -61,7 +61,8 @@ class BoxTracker:
         self._unseen += frames
         track = np.full(len(boxes), -1, dtype=np.int64)
         seen = np.zeros(len(self._id), dtype=np.bool_)
-        expected = _as_boxes(self._mean)
+        middle, half = self._mean[:, :2], np.maximum(self._mean[:, 2:4], 1.0) / 2.0
+        expected = np.hstack([middle - half, middle + half])
         sure = scores >= self._high_score
         for candidates, tracks, least in (
             # A high-score box continues a track whose predicted box it overlaps more [1]: a small
@@ -126,12 +127,6 @@ def _as_states(boxes: Floats) -> Floats:
     """Return the centre x, y, width, height of boxes (n, 4)."""
     size = np.maximum(boxes[:, 2:] - boxes[:, :2], 1.0)
     return np.hstack([(boxes[:, :2] + boxes[:, 2:]) / 2.0, size])
-
-
-def _as_boxes(means: Floats) -> Floats:
-    """Return x0, y0, x1, y1 of states (n, 8)."""
-    half = np.maximum(means[:, 2:4], 1.0) / 2.0
-    return np.hstack([means[:, :2] - half, means[:, :2] + half])
 
 
 @dataclass

@@ -11,7 +11,6 @@ import codecs
 import errno
 import hashlib
 import json
-import os
 import re
 import tempfile
 import tomllib
@@ -24,6 +23,7 @@ from xml.etree import ElementTree
 import yaml
 
 from worldpose.errors import InputError, say_failure
+from worldpose.store.blobs import sync_path
 
 ENTRY_LENGTH = 1 << 20
 """Maximum characters of one entry; a person's keypoints have under a thousand."""
@@ -75,15 +75,6 @@ def whole_file(path: Path) -> Iterator[Path]:
         sync_path(draft)
         draft.replace(path)
     sync_path(path.parent)
-
-
-def sync_path(path: Path) -> None:
-    """Sync a file, or the entries of a folder, to disk."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 FULL: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)

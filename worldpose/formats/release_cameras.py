@@ -115,9 +115,7 @@ def read_camera(path: Path, image_size: tuple[int, int] | None = None) -> Camera
     return camera if len(k) > 1 else camera[0]
 
 
-_ROW_MEMBERS: Final = {
-    "K": Member(("rows", 3, 3), "float"),
-    "k": Member(("rows", 5), "float"),
+_ROW_MEMBERS: Final = MEMBERS | {
     "R": Member(("poses", 3, 3), "float"),
     "t": Member(("poses", 3), "float"),
     "Rt": Member(("poses", 3, 4), "float", required=False),

@@ -44,17 +44,8 @@ def write_usd(
     with a skeleton of 24 joints, its animation, and a mesh with the person's shape and the model's
     skinning weights, without pose correctives. A missing person is invisible. Cameras have
     focal length, principal point and pose, and their distortion as custom data, or as an attribute
-    of the same name with time samples where it changes.
-
-    Args:
-        path: the file.
-        model: body model of the poses.
-        people: bodies over the same frames.
-        fps: frames per second.
-        cameras: cameras by name, single or one per frame, with NaN where unknown.
-        markings: lines on the pitch (points, 3) [m], world.
-        notes: texts for the stage's custom data; `licence` is among them.
-        surface: write the surface of bodies, not only their joints.
+    of the same name with time samples where it changes. Arguments are as of `write_gltf`; `notes`
+    become the stage's custom data.
 
     Raises:
         InputError: no person has a body.

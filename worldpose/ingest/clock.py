@@ -162,10 +162,6 @@ class ImageClock:
         after = np.searchsorted(self.number, number, side="right")
         return np.asarray(np.maximum(after - 1, 0), dtype=np.int64)
 
-    def nearest_frame(self, number: int) -> int:
-        """Return the place of the match frame whose image is nearest to the image of a number."""
-        return int(np.abs(self.number - number).argmin())
-
     def to_images(self, values: Floats, late: float = 0.0) -> Floats:
         """Return values (frames, ...) at the times of each frame's image and `late` frames on."""
         return rows_at(values, np.arange(len(values)) + self.late + late)

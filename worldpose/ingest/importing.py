@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final, Literal, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 
@@ -55,7 +55,6 @@ def import_match(
     fps: float,
     out: Path,
     match_id: str | None = None,
-    pitch: Literal["none"] | None = "none",
     place: Placing | None = None,
 ) -> tuple[MatchSpec, list[str]]:
     """Write a match folder with the cameras of a calibration and their detections.
@@ -64,9 +63,8 @@ def import_match(
     numbers from the files. The function validates all 2D poses and stores them as npz: they are
     `<camera>.json` or `.npz` for each camera of the calibration, or a folder of OpenPose's files
     for each. The match's id is by default the name of `out`, which is absent or empty. The pitch is
-    "none", or None for the standard pitch, if the calibration's world is the pitch's. `place`
-    brings the cameras to metres with z up; None = they are.
-    Returned are the content of match.yaml, and sentences about what was found and changed.
+    "none". `place` brings the cameras to metres with z up; None = they are. Returned are the
+    content of match.yaml, and sentences about what was found and changed.
     InputError if a file is invalid, names do not match, there are no people, or `out` is not empty;
     nothing is written then.
     """
@@ -84,7 +82,7 @@ def import_match(
         cameras, notes = place(calibration, cameras, people, fps)
     sizes = {name: camera.image_size for name, camera in cameras.items()}
     notes += describe_outside(people, sizes)
-    spec = build_spec(out, match_id, fps, sizes, (first, stop), pitch=pitch)
+    spec = build_spec(out, match_id, fps, sizes, (first, stop))
     write_match(out, spec, calibrations=cameras, observations=people)
     return spec, notes + describe_left_out(left_out) + describe_people(read)
 
@@ -294,7 +292,6 @@ def build_spec(
     *,
     videos: Mapping[str, Path] = MappingProxyType({}),
     offsets: Mapping[str, int] = MappingProxyType({}),
-    pitch: str | None = "none",
 ) -> MatchSpec:
     """Return match.yaml of a match with the one clip `clip`.
 
@@ -306,7 +303,6 @@ def build_spec(
         frames: the clip's first frame, and the one after its last.
         videos: file in `videos/` of those cameras that have one.
         offsets: `offset_frames` of those cameras whose clock is another.
-        pitch: entry `pitch`.
 
     Raises:
         InputError: an entry is invalid.
@@ -321,7 +317,7 @@ def build_spec(
             for name, (width, height) in sizes.items()
         ],
         "clips": [{"id": "clip", "first_frame": frames[0], "frame_count": frames[1] - frames[0]}],
-        "pitch": pitch,
+        "pitch": "none",
     }
     return validate_record(MatchSpec, content, str(out / "match.yaml"))
 

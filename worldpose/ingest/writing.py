@@ -24,13 +24,14 @@ from worldpose.errors import InputError, say_failure
 from worldpose.formats.calibration_files import known_id
 from worldpose.formats.calibration_writer import write_calibration_toml
 from worldpose.formats.detection_files import read_boxes
-from worldpose.formats.files import FULL, sync_path, whole_file
+from worldpose.formats.files import FULL, whole_file
 from worldpose.formats.keypoint_files import read_keypoint_arrays, write_keypoint_arrays
 from worldpose.ingest.annotations import clicked_file, key_frames_file
 from worldpose.ingest.footage import write_still
 from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.ingest.validation import require_local, validate_record
+from worldpose.store.blobs import sync_path
 from worldpose.video.folder import index_video
 from worldpose.video.pictures import FrameIndex
 

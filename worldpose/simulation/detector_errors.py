@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -117,10 +117,6 @@ class Detector:
                 joint_bias[joint] = joint_bias[mirror] * [1.0, -1.0, 1.0]
         joint_bias[_SIDE == 0.0, 1] = 0.0
         return cls(scenario, pitch, joint_bias, rng.standard_normal((17, 2, 2)), own_bias)
-
-    def at_rate(self, fps: float) -> Detector:
-        """Return the same detector for videos of another frame rate."""
-        return replace(self, scenario=self.scenario.model_copy(update={"fps": fps}))
 
     def perceive(self, joints: Floats) -> Floats:
         """Return offsets (frames, persons, 17, 3) [m], world, to the detector's joints."""

@@ -290,11 +290,7 @@ def open_view(
 
 
 def render_pitch(
-    camera: Camera,
-    pitch: PitchTemplate,
-    people: BodyParameters | None,
-    seed: int,
-    settings: RenderingSettings | None = None,
+    camera: Camera, pitch: PitchTemplate, people: BodyParameters | None, seed: int
 ) -> Image:
     """Return one image (height, width, 3) in RGB; the same arguments give the same bytes.
 
@@ -313,7 +309,7 @@ def render_pitch(
     roles: list[Role] = [("first", "second")[n % 2] for n in range(len(people.betas))]
     cast = dress_people(people.betas, roles, seed)
     posed = cast.pose(people)
-    return open_view(camera, pitch, seed, settings).expose(Moment(cast, posed, posed)).image
+    return open_view(camera, pitch, seed).expose(Moment(cast, posed, posed)).image
 
 
 _FINER: Final = 1.15

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -308,7 +308,7 @@ def simulate_scene(
     broadcast = dict[str, MovingView]()
     for number, settings in enumerate(scenario.broadcast):
         place, detections = broadcast_seed.spawn(2)
-        name = view_name(scenario, number)
+        name = CLIP_ID if len(scenario.broadcast) == 1 else f"{CLIP_ID}.{broadcast_id(number)}"
         fps = settings.fps or scenario.fps
         size = settings.image_size_px or scenario.rig.image_size_px
         nearest = camera_frames(np.arange(len(times)), 0.0, fps / scenario.fps)
@@ -318,7 +318,7 @@ def simulate_scene(
         )
         broadcast[name] = view = MovingView(camera, fps, nearest)
         seen = joints if view.fps == scenario.fps else crowd.joints(view.times)
-        faster = detector.at_rate(view.fps)
+        faster = replace(detector, scenario=scenario.model_copy(update={"fps": view.fps}))
         reports[name], _ = faster.film(view.camera, seen, crowd.heights, _rng(detections))
     return Scene(
         truth=JointTracks(np.arange(len(times)), np.arange(len(own)), joints, views=views),
@@ -334,11 +334,6 @@ def simulate_scene(
         clicks=clicks,
         surveyed=survey(scenario.pitch, scenario.survey_error, _rng(survey_seed)),
     )
-
-
-def view_name(scenario: Scenario, number: int) -> str:
-    """Return the name of a broadcast view, the clip's if there is one alone."""
-    return CLIP_ID if len(scenario.broadcast) == 1 else f"{CLIP_ID}.{broadcast_id(number)}"
 
 
 def broadcast_id(number: int) -> str:

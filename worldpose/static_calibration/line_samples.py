@@ -6,7 +6,7 @@ both sides. A crossbar, and the other side of a far circle, are close to a sampl
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -45,10 +45,6 @@ class PaintNoise:
     unevenness_m: float
     shift_px: float
     reading: float
-
-    def relative_difference(self, other: PaintNoise) -> float:
-        """Return the largest relative difference of a standard deviation from another's [1]."""
-        return float(np.abs(np.divide(astuple(self), astuple(other)) - 1.0).max())
 
     def update(self, least: PaintNoise, paint: PaintUnknowns, residuals: Floats) -> PaintNoise:
         """Return the noise after one step of the evidence maximization, at least the stated one.

@@ -340,7 +340,8 @@ class LineSearch:
             known = np.isfinite(adjusted.residuals)
             scaled = (adjusted.residuals / np.sqrt(variances))[known]
             self.noise = before.update(self.least, adjusted.paint, scaled)
-            if self.noise.relative_difference(before) < 0.01:
+            change = np.divide(astuple(self.noise), astuple(before)) - 1.0
+            if np.abs(change).max() < 0.01:
                 break
         seen, variances = self.look(found.camera, found.samples), own * self.noise.reading**2
         return self.converge(replace(found, seen=seen, variances=variances), True)

@@ -363,25 +363,11 @@ def calibration_arrays(calibration: StaticCalibration) -> dict[str, NDArray[Any]
     }
 
 
-def calibration_coordinates(calibration: StaticCalibration) -> dict[str, NDArray[Any]]:
-    """Return the grid coordinates of the expected ground error; a given camera has none."""
-    known = calibration.report.ground_error
-    return {"ground_x": known.x, "ground_y": known.y}
-
-
-def given_attributes(camera_id: str) -> dict[str, Any]:
-    """Return the stored attributes of a given camera."""
-    return {"camera_id": camera_id, "origin": "given", **_no_evidence()}
-
-
-def left_out_attributes(camera_id: str, reason: str) -> dict[str, Any]:
-    """Return the stored attributes of a camera without calibration; it has no arrays."""
-    return {"camera_id": camera_id, "origin": "none", **_no_evidence(), "reasons": [reason]}
-
-
-def _no_evidence() -> dict[str, Any]:
+def uncalibrated_attributes(camera_id: str, origin: str, *reasons: str) -> dict[str, Any]:
+    """Return the stored attributes of a camera that is given, or left out for a reason."""
     lists = ("point", "point_problem", "marking", "free", "decisions", "reasons", "add_next")
-    return {**{name: [] for name in lists}, "noise_scale": None, "condition": None}
+    stated = {"camera_id": camera_id, "origin": origin, **{name: [] for name in lists}}
+    return {**stated, "noise_scale": None, "condition": None, "reasons": list(reasons)}
 
 
 def calibration_attributes(camera_id: str, calibration: StaticCalibration) -> dict[str, Any]:

@@ -387,7 +387,8 @@ def _missing_feature_error(target: Path, error: OSError) -> StoreError:
     )
 
 
-def _sync(path: Path) -> None:
+def sync_path(path: Path) -> None:
+    """Sync a file, or the entries of a folder, to disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -398,7 +399,7 @@ def _sync(path: Path) -> None:
 def _sync_folder(path: Path) -> None:
     """Sync a folder's entries; some file systems (SMB, FUSE) do that themselves and refuse it."""
     try:
-        _sync(path)
+        sync_path(path)
     except OSError as error:
         if error.errno not in (errno.EINVAL, errno.EBADF, errno.ENOTSUP, errno.ENOSYS):
             raise
@@ -416,7 +417,7 @@ def _sync_tree(folder: Path) -> None:
         folders.append(Path(inner))
         files += [Path(inner, name) for name in names]
     with ThreadPoolExecutor(sync_threads) as threads:
-        for _ in threads.map(_sync, files):
+        for _ in threads.map(sync_path, files):
             pass
         for _ in threads.map(_sync_folder, folders):
             pass

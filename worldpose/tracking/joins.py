@@ -173,11 +173,6 @@ def _join_cost(old: End, new: End, gap: float, area: float, settings: TrackingSe
     return -odds - _shape_odds(old, new, settings)
 
 
-def _freshness(gap: float, settings: TrackingSettings) -> float:
-    """Return the share of people whose place after a time unseen [s] follows from their motion."""
-    return math.exp(-((gap / settings.place_memory_s) ** 2))
-
-
 def _shape_odds(old: End, new: End, settings: TrackingSettings) -> float:
     """Return the log odds by limb lengths that two tracks are one person: by size and proportions.
 
@@ -257,7 +252,9 @@ def choose_joins(
         gain[i, j] = kept
         old, new = before[row[i]], after[column[j]]
         cost, gap = float(costs[row[i], column[j]]), float(gaps[row[i], column[j]])
-        needed = sure + overrated * _freshness(gap, settings)
+        # The share of people whose place after this time unseen follows from their motion.
+        fresh = math.exp(-((gap / settings.place_memory_s) ** 2))
+        needed = sure + overrated * fresh
         joins.append(
             Candidate(
                 old.number, new.number, old.frame, new.frame, cost, float(margin), margin >= needed

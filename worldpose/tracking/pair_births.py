@@ -58,12 +58,9 @@ class CameraVisibility:
         with np.errstate(invalid="ignore"):
             inside = ((image >= 0.0) & (image <= size)).all(axis=-1).sum(axis=-1)
         known = np.isfinite(joints[..., 0]).sum(axis=1)
-        return np.asarray((inside >= 0.8 * known) & (known > 0) & self._in_reach(joints))
-
-    def _in_reach(self, joints: Floats) -> Flags:
-        """Return whether bodies (n, 17, 3) are within each camera's range (cameras, n)."""
         away = np.linalg.norm(np.nanmean(joints, axis=1) - self.centers[:, None], axis=-1)
-        return np.asarray(away <= 1.25 * self.reach[:, None])
+        near = away <= 1.25 * self.reach[:, None]
+        return np.asarray((inside >= 0.8 * known) & (known > 0) & near)
 
     def learn(
         self,

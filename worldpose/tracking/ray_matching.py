@@ -7,10 +7,41 @@ import math
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from data_contracts.arrays import Flags, Floats, Integers
+from data_contracts.arrays import ClipArray, Flags, Floats, Integers
+from data_contracts.keypoints import KeypointDetections
 from worldpose.compiled import compile_kernel
+from worldpose.errors import InputError
+from worldpose.geometry.cameras import Camera
 
 Point = tuple[float, float, float]
+
+
+def require_clip(
+    where: str,
+    cameras: Camera,
+    detections: KeypointDetections[ClipArray],
+    *,
+    tracked: bool = False,
+    least: int = 0,
+) -> None:
+    """Require arrays of one clip and of its cameras, of which there are at least so many.
+
+    InputError if the shapes do not match; those of `detection_index` count if people are tracked.
+    """
+    keypoints, confidence = detections.keypoints.shape, detections.confidence.shape
+    index, views = detections.detection_index.shape, cameras.batch_shape
+    fits = len(confidence) == 4 and keypoints == (*confidence, 2) and views == confidence[1:2]
+    if tracked:
+        fits = fits and len(index) == 3 and index[:2] == confidence[:2]
+    if not fits or views[0] < least:
+        raise InputError(
+            where,
+            expected="keypoints (frames, cameras, detections, joints, 2), confidence without the "
+            f"last, cameras (cameras,){f' of {least} or more' if least else ''}"
+            f"{', detection_index (frames, cameras, persons)' if tracked else ''}",
+            found=f"{keypoints}, {confidence}, {views}{f', {index}' if tracked else ''}",
+            todo="Give arrays of the same clip and cameras.",
+        )
 
 
 @compile_kernel

@@ -14,7 +14,6 @@ from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import Record
 from data_contracts.tracking import Join, Track
 from worldpose.compiled import compile_kernel, map_in_threads
-from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera, Cameras
 from worldpose.ingest.clock import row_rate
 from worldpose.static_calibration.parameters import project_with_jacobian
@@ -23,6 +22,7 @@ from worldpose.tracking.joins import Candidate, Takeover, lasting_takeovers
 from worldpose.tracking.people_selection import join_people
 from worldpose.tracking.person import Person
 from worldpose.tracking.plane.feet import PIXEL_SHARE, PIXEL_STD
+from worldpose.tracking.ray_matching import require_clip
 from worldpose.tracking.settings import TrackingSettings
 
 
@@ -117,15 +117,8 @@ def track_people(
     """
     cameras = Camera.batch(cameras)
     fps = row_rate("tracking", fps, detections.frame)
+    require_clip("tracking", cameras, detections)
     keypoints, confidence = detections.keypoints, detections.confidence
-    if keypoints.shape != (*confidence.shape, 2) or cameras.batch_shape != confidence.shape[1:2]:
-        raise InputError(
-            "tracking",
-            expected="keypoints (frames, cameras, detections, joints, 2), confidence without the "
-            "last, cameras (cameras,)",
-            found=f"{keypoints.shape}, {confidence.shape}, {cameras.batch_shape}",
-            todo="Give arrays of the same clip and cameras.",
-        )
     tracker = FrameTracker(cameras, fps, pitch_size is not None, people, settings)
     frames = confidence.shape[0]
     # The accuracy of an angle is a pixel over the focal length.

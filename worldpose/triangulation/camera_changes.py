@@ -251,9 +251,7 @@ def _take_back(
     rows = np.arange(start, start + len(keypoints))
     for part in views:
         c, share = part.camera, part.share(rows, frames)
-        for each in np.unique(share[share > 0.0]):
-            amount = each * view_amount(part, cameras[c])
-            keypoints[share == each, c] = move_back(keypoints[share == each, c], cameras[c], amount)
+        _turn_rows(keypoints[:, c], share, cameras[c], view_amount(part, cameras[c]), back=True)
     return replace(people, keypoints=keypoints)
 
 
@@ -291,12 +289,6 @@ def refine_change(
     return join_changes(cameras[camera], known, change_record(measured, known.camera, frame))
 
 
-def move_back(pixels: Floats, camera: Camera, amount: Floats) -> Floats:
-    """Return the pixels (..., 2) that a camera had shown before its view changed."""
-    back = np.asarray(np.linalg.inv(_view_motion(camera, amount)), dtype=np.float64)
-    return _turn_view(pixels, camera, back)
-
-
 def move_on(
     pixels: Floats, frame: Integers, camera: Camera, changes: Sequence[CameraChange]
 ) -> Floats:
@@ -307,10 +299,7 @@ def move_on(
     """
     moved: NDArray[np.float64] = np.array(pixels, dtype=np.float64)
     for change in reversed(changes):
-        share = _shares(change, frame)
-        for part in np.unique(share[share > 0.0]):
-            motion = _view_motion(camera, np.asarray(part * _view_amount(change)))
-            moved[share == part] = _turn_view(np.asarray(moved[share == part]), camera, motion)
+        _turn_rows(moved, _shares(change, frame), camera, _view_amount(change), back=False)
         if change.is_left_out:
             moved[_inside(change, frame)] = np.nan
     return moved
@@ -348,10 +337,7 @@ def correct_views(
     moved: NDArray[np.float64] = np.array(pixels, dtype=np.float64)
     for change in changes:
         c, share = list(cameras).index(change.camera), _shares(change, frame)
-        for part in np.unique(share[share > 0.0]):
-            rows = share == part
-            amount = part * _view_amount(change)
-            moved[rows, c] = move_back(np.asarray(moved[rows, c]), cameras[change.camera], amount)
+        _turn_rows(moved[:, c], share, cameras[change.camera], _view_amount(change), back=True)
         if change.is_left_out:
             moved[_inside(change, frame), c] = np.nan
     return moved
@@ -367,11 +353,20 @@ def _view_motion(camera: Camera, amount: Floats) -> Floats:
     return np.asarray([[1.0 + zoom], [1.0 + zoom], [1.0]] * turn)
 
 
-def _turn_view(pixels: Floats, camera: Camera, motion: Floats) -> Floats:
-    """Return where pixels (..., 2) of a camera lie after a motion of its view."""
-    plane = camera.normalize(pixels.reshape(-1, 2))
-    rays = np.concatenate([plane, np.ones((len(plane), 1))], axis=1) @ motion.T
-    return replace(camera, cam_from_world=Rigid.identity()).project(rays).reshape(pixels.shape)
+def _turn_rows(
+    pixels: Floats, share: Floats, camera: Camera, amount: Floats, *, back: bool
+) -> None:
+    """Move pixels (frames, ..., 2) in place by their shares (frames,) of a view's motion.
+
+    `back` gives the pixels that the camera had shown before its view changed.
+    """
+    unturned = replace(camera, cam_from_world=Rigid.identity())
+    for part in np.unique(share[share > 0.0]):
+        rows, motion = pixels[share == part], _view_motion(camera, part * amount)
+        turn = np.linalg.inv(motion) if back else motion
+        plane = camera.normalize(rows.reshape(-1, 2))
+        rays = np.concatenate([plane, np.ones((len(plane), 1))], axis=1) @ turn.T
+        pixels[share == part] = unturned.project(rays).reshape(rows.shape)
 
 
 def is_same_change(one: CameraChange, other: CameraChange, fps: float) -> bool:

@@ -28,6 +28,7 @@ from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera, Cameras
 from worldpose.ingest.clock import row_rate
 from worldpose.reference_method import require_torch
+from worldpose.tracking.ray_matching import require_clip
 from worldpose.triangulation.clocks import estimate_clocks, read_frames
 from worldpose.triangulation.limb_lengths import (
     find_swaps,
@@ -445,23 +446,8 @@ def check_shapes(
     Raises:
         InputError: shapes do not match, or an index is invalid.
     """
-    keypoints, confidence = detections.keypoints, detections.confidence
+    require_clip("triangulation", cameras, detections, tracked=True)
     detection_index = detections.detection_index
-    if (
-        confidence.ndim != 4
-        or keypoints.shape != (*confidence.shape, 2)
-        or detection_index.ndim != 3
-        or detection_index.shape[:2] != confidence.shape[:2]
-        or cameras.batch_shape != confidence.shape[1:2]
-    ):
-        raise InputError(
-            "triangulation",
-            expected="keypoints (frames, cameras, detections, joints, 2), confidence without the "
-            "last, detection_index (frames, cameras, persons), cameras (cameras,)",
-            found=f"{keypoints.shape}, {confidence.shape}, {detection_index.shape}, "
-            f"{cameras.batch_shape}",
-            todo="Give arrays of the same clip and cameras.",
-        )
     if camera_covariance is not None and camera_covariance.shape != (*cameras.batch_shape, 12, 12):
         raise InputError(
             "triangulation: camera_covariance",
@@ -469,14 +455,11 @@ def check_shapes(
             found=f"{camera_covariance.shape}",
             todo="Give the covariance of every camera's calibration, or none.",
         )
-    detections = confidence.shape[2]
-    if (
-        detection_index.size
-        and not -1 <= detection_index.min() <= detection_index.max() < detections
-    ):
+    most = detections.confidence.shape[2]
+    if detection_index.size and not -1 <= detection_index.min() <= detection_index.max() < most:
         raise InputError(
             "triangulation: detection_index",
-            expected=f"-1 or the place of one of {detections} detections",
+            expected=f"-1 or the place of one of {most} detections",
             found=f"{detection_index.min()} to {detection_index.max()}",
             todo="Give the index that was made from these detections.",
         )

@@ -29,7 +29,6 @@ from worldpose.triangulation.track_solver import (
     held_out_cost,
     prepare_tiles,
     select_person,
-    solve_segment,
     solve_tiles,
 )
 
@@ -174,7 +173,8 @@ def smooth_joints(
             costs = TrackCosts(settings.noise, limit, float(penalty[joint]))
             for part in segments(np.isfinite(given[:, 0]), gap):
                 pixels = track.pixels[joint, :, part]
-                x, c = solve_segment(pixels, weights[joint, :, part], given[part], rig, costs)
+                tiles = prepare_tiles(pixels, weights[joint, :, part], rig)
+                x, c = solve_tiles(tiles, given[part], rig, costs)
                 # One gross error must not spoil a whole track.
                 good = np.isfinite(x).all() and np.isfinite(c).all()
                 joints[part, person, joint] = x if good else given[part]

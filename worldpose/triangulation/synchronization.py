@@ -19,11 +19,11 @@ from worldpose.camera_consistency.comparison import Comparison
 from worldpose.camera_consistency.consistency import select_busiest_frames
 from worldpose.camera_consistency.hypotheses import STATED
 from worldpose.camera_consistency.settings import ConsistencySettings
-from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.tracking.plane.clocks import estimate_plane_clocks
 from worldpose.tracking.plane.feet import locate_feet
+from worldpose.tracking.ray_matching import require_clip
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.tracker import track_people
 from worldpose.triangulation.clocks import (
@@ -95,15 +95,8 @@ def synchronize(
     Raises:
         InputError: fewer than two cameras, or shapes that do not fit together.
     """
-    keypoints, confidence = detections.keypoints, detections.confidence
-    count = int(cameras.batch_shape[0])
-    if count < 2 or keypoints.shape != (*confidence.shape, 2) or confidence.shape[1] != count:
-        raise InputError(
-            "synchronization",
-            expected="two cameras or more, keypoints (frames, cameras, detections, joints, 2)",
-            found=f"{cameras.batch_shape}, {keypoints.shape}",
-            todo="Give the detections of all cameras of a clip.",
-        )
+    require_clip("synchronization", cameras, detections, least=2)
+    confidence, count = detections.confidence, len(cameras.focal)
     # Longest part of a clip that is compared, the one with the most people [s].
     longest = round((30.0 + 2.0 * max_offset_s) * fps)
     detections = detections[select_busiest_frames(confidence, longest)]

@@ -92,28 +92,12 @@ class TrackCosts(NamedTuple):
     penalty: float
 
 
-def solve_segment(
-    pixels: Floats,
-    weights: Floats,
-    given: Floats,
-    rig: Rig,
-    costs: TrackCosts,
-) -> tuple[Floats, Floats]:
+def solve_tiles(tiles: Tiles, given: Floats, rig: Rig, costs: TrackCosts) -> tuple[Floats, Floats]:
     """Return a joint's points (frames, 3) [m] and covariance (frames, 3, 3) [m^2] over time.
 
-    Args:
-        pixels: (cameras, frames, 2) [px].
-        weights: (cameras, frames), inverse of the factor on the stated variance; 0 or NaN = no
-            observation.
-        given: (frames, 3) [m], initial points; the first and last frame are not NaN.
-        rig: the cameras.
-        costs: weights of the two kinds of errors.
+    The tiles are of `prepare_tiles`. The first and last frame of the initial points `given`
+    (frames, 3) [m] are not NaN.
     """
-    return solve_tiles(prepare_tiles(pixels, weights, rig), given, rig, costs)
-
-
-def solve_tiles(tiles: Tiles, given: Floats, rig: Rig, costs: TrackCosts) -> tuple[Floats, Floats]:
-    """Return what `solve_segment` does, from the tiles of its observations."""
     frames = np.arange(len(given))
     known = np.isfinite(given[:, 0])
     columns = [np.interp(frames, frames[known], column[known]) for column in given.T]
@@ -124,7 +108,11 @@ def solve_tiles(tiles: Tiles, given: Floats, rig: Rig, costs: TrackCosts) -> tup
 
 
 def prepare_tiles(pixels: Floats, weights: Floats, rig: Rig) -> Tiles:
-    """Return tiles (parts, cameras) of one joint's observations, one lane per frame; all used."""
+    """Return tiles (parts, cameras) of one joint's observations, one lane per frame; all used.
+
+    Weights (cameras, frames) are the inverse of the factor on the stated variance of pixels
+    (cameras, frames, 2); 0 or NaN = no observation.
+    """
     count, frames = weights.shape
     tiles = np.zeros((-(-frames // LANES), count), TILE)
     index = np.zeros((1, count, 1), np.int64)

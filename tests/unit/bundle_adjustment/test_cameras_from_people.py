@@ -10,7 +10,7 @@ from rigs import errors
 from data_contracts.cameras import LensCalibration
 from data_contracts.keypoints import KeypointDetections
 from worldpose.bundle_adjustment.clip import Clicks
-from worldpose.bundle_adjustment.estimate import adjust_cameras
+from worldpose.bundle_adjustment.estimate import adjust_cameras, adjust_unguarded
 from worldpose.bundle_adjustment.held_out_validation import held_out_errors
 from worldpose.bundle_adjustment.people_cameras import KnownLength, locate_cameras
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings, SolverSettings
@@ -273,8 +273,6 @@ def test_what_tells_nothing_leaves_cameras_as_they_were_and_says_why(clip, case)
 @pytest.mark.parametrize("evidence", ["markings_and_players", "markings"])
 def test_the_papers_adjustment_finds_the_cameras_of_exact_markings_and_people(clip, evidence):
     pytest.importorskip("torch")
-    from worldpose.bundle_adjustment.paper_variant import adjust_unguarded
-
     made, true, _ = clip(noise=0.0, clicked=14)
     exact = tuple(
         replace(one, points_image=true[c].project(one.points_world))

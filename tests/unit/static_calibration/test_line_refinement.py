@@ -14,7 +14,7 @@ from worldpose.body.model import BodyParameters
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
 from worldpose.static_calibration.estimate import calibrate_camera
-from worldpose.static_calibration.from_paint.proposal import calibrate_without_clicks
+from worldpose.static_calibration.from_paint.proposal import calibrate_proposal, propose_camera
 from worldpose.static_calibration.from_paint.thin_paint import trace_marking
 from worldpose.static_calibration.line_refinement import refine_on_lines
 from worldpose.static_calibration.parameters import (
@@ -229,6 +229,7 @@ def farthest(found, true, names):
 def test_a_midfield_still_is_calibrated_on_the_stated_side():
     true = circle_camera((0.0, 1.0), 2300.0)
     still = render_pitch(true, PITCH, None, 5)
-    found = calibrate_without_clicks(PITCH, still, side="far").estimate.camera
+    proposal = propose_camera(still, PITCH, side="far")
+    found = calibrate_proposal(PITCH, proposal, still).estimate.camera
     assert found.center[1] > 30.0  # the image looks the same from the near side
     assert farthest(found, true, ("halfway_line", "center_circle")) < 3.0

@@ -12,7 +12,6 @@ from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
 from worldpose.static_calibration.from_paint.proposal import (
     calibrate_proposal,
-    calibrate_without_clicks,
     propose_camera,
     propose_from_paint,
 )
@@ -70,7 +69,7 @@ def test_a_rendered_still_gives_its_camera_without_a_click(proposal):
 @pytest.mark.slow
 def test_a_purple_cast_hides_no_pitch():
     cast = np.clip(still() * np.array([1.4, 0.5, 1.4]), 0, 255).astype(np.uint8)
-    found = calibrate_without_clicks(PITCH, cast, side="near")
+    found = calibrate_proposal(PITCH, propose_camera(cast, PITCH, side="near"), cast)
     assert np.median(misplaced(found.estimate.camera, camera())) < 0.05
 
 
@@ -85,7 +84,7 @@ def test_too_little_paint_is_refused_with_what_to_click():
     assert propose_from_paint([paint], PITCH, side="near") is None
     grass = np.full((720, 1280, 3), (60, 120, 50), np.uint8)
     with pytest.raises(InputError, match=r"image of cam3: expected three straight.*Click"):
-        calibrate_without_clicks(PITCH, grass, side="near", where="image of cam3")
+        propose_camera(grass, PITCH, side="near", where="image of cam3")
 
 
 def test_lines_that_many_cameras_explain_are_not_clear():

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
-from data_contracts.release import BaselineSettings
 from worldpose.body.body_file import is_open_body
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BodyModel, BodyParameters
@@ -94,12 +93,6 @@ def write_slahmr_cameras(path: Path, camera: Camera) -> None:
             "w2c": transforms,
         },
     )
-
-
-def write_baseline_settings(path: Path, settings: BaselineSettings) -> None:
-    """Write the settings for running the methods, as JSON."""
-    with whole_file(path) as draft:
-        draft.write_text(settings.model_dump_json(indent=2) + "\n", encoding="utf-8")
 
 
 World = Literal["shared", "own", "camera"]

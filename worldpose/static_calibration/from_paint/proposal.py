@@ -241,20 +241,14 @@ def propose_camera(
 
 
 def propose_from_paint(
-    paints: Iterable[PaintMap],
-    pitch: PitchTemplate,
-    *,
-    side: Side,
-    prior: CameraPrior | None = None,
-    lens: Camera | None = None,
+    paints: Iterable[PaintMap], pitch: PitchTemplate, *, side: Side
 ) -> Proposal | None:
     """Return the camera that explains the paint of an image best, or None.
 
-    The paint is that under every lens that the image may have, the likely one first; `lens` is the
-    known one. The camera stands on a side of the pitch.
+    The paint is that under every lens that the image may have, the likely one first. The camera
+    stands on a side of the pitch.
     """
-    likely = (prior or CameraPrior()).beside(pitch.spec)
-    found = rank_under_lenses(paints, pitch, likely, lens)
+    found = rank_under_lenses(paints, pitch, CameraPrior().beside(pitch.spec), None)
     return None if found is None else _propose_first(found, pitch, side)
 
 
@@ -275,37 +269,6 @@ def _propose_first(found: RankedCameras, pitch: PitchTemplate, side: Side) -> Pr
     )
 
 
-def calibrate_without_clicks(
-    pitch: PitchTemplate,
-    picture: Image,
-    *,
-    side: Side,
-    settings: StaticCalibrationSettings | None = None,
-    where: str = "image",
-    lens: LensCalibration | None = None,
-) -> StaticCalibration:
-    """Return the camera of an image, its covariance and its report, from the image alone.
-
-    The markings of a clear proposal are calibrated as if they had been drawn. The calibration has
-    to agree with the proposal.
-
-    Args:
-        pitch: the stadium's template.
-        picture: (height, width, 3) RGB.
-        side: where the camera stands.
-        settings: noise, prior and thresholds; the defaults if None.
-        where: file or camera, for messages.
-        lens: a lens that was calibrated before; None = not known.
-
-    Raises:
-        InputError: the image shows too little, other cameras explain it nearly as well, or the
-            calibration disagrees with the proposal; the message says what to click.
-    """
-    stated = settings or StaticCalibrationSettings()
-    proposal = propose_camera(picture, pitch, side=side, prior=stated.prior, lens=lens, where=where)
-    return calibrate_proposal(pitch, proposal, picture, settings=stated, where=where, lens=lens)
-
-
 def calibrate_proposal(
     pitch: PitchTemplate,
     proposal: Proposal,
@@ -316,6 +279,8 @@ def calibrate_proposal(
     lens: LensCalibration | None = None,
 ) -> StaticCalibration:
     """Return the camera of a clear proposal in an RGB image, its covariance and its report.
+
+    The proposed markings are calibrated as if they had been drawn.
 
     Raises:
         InputError: the proposal is not clear, or the calibration disagrees with it.

@@ -131,13 +131,10 @@ class GroundPositions:
 
     def number_seen(self) -> NDArray[np.int64]:
         """Return how many detections have a place (frames, cameras)."""
+        parts = self.xy.parts if isinstance(self.xy, FrameBlocks) else (self.xy,)
         return np.concatenate(
-            [np.isfinite(part[..., 0]).sum(axis=2, dtype=np.int64) for part in self.parts_xy()]
+            [np.isfinite(part[..., 0]).sum(axis=2, dtype=np.int64) for part in parts]
         )
-
-    def parts_xy(self) -> Sequence[Floats]:
-        """Return `xy` of consecutive frames."""
-        return self.xy.parts if isinstance(self.xy, FrameBlocks) else (self.xy,)
 
 
 def locate_feet(
