@@ -112,6 +112,14 @@ def test_corners_and_only_the_line_through_them_do_not_determine_a_camera():
         of(ClickedMarkings(points=clicked.points, drawn=drawn))
 
 
+def test_parallel_lines_alone_do_not_tell_where_along_them_a_camera_stands():
+    camera = people.pinhole((-30.0, -70.0, 18.0), (-40.0, 0.0, 0.0), 3000.0, SIZE)
+    names = ["penalty_area_left_front", "goal_line_left", "goal_area_left_front"]
+    drawn = people.draw(camera, names, np.random.default_rng(0), noise=1.0)
+    with pytest.raises(InputError, match="three straight markings in two directions"):
+        of(ClickedMarkings(drawn=drawn))
+
+
 def test_left_and_right_exchanged_is_told_from_wrong_clicks():
     camera, _ = people.seat(1)
     swap = {"left": "right", "right": "left"}
