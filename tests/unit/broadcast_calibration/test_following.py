@@ -96,6 +96,21 @@ def test_key_frames_of_a_wide_lens_keep_the_model_of_the_clip():
     assert off.max() < 9.0  # k1, k2 and k3 of the fisheye, read as Brown's: over 300 px
 
 
+@pytest.mark.parametrize(("mean", "names"), [(-75.0, 2), (75.0, 2), (75.0, 3)])
+def test_key_frames_stand_on_the_side_of_the_others_or_else_of_the_prior(mean, names):
+    true, rng = clip.moving(2, pan=(-2.0, 6.0)), np.random.default_rng(2)
+    drawn = [clip.draw(true, 0, 1.0, rng)[:2], clip.draw(true, 1, 1.0, rng)[:names]]
+    keys = [
+        KeyFrame(frame=n, markings=ClickedMarkings.model_validate({"points": [], "drawn": each}))
+        for n, each in enumerate(drawn)
+    ]
+    settings = BroadcastCalibrationSettings(prior=BroadcastPrior(center_m=(0.0, mean, 17.0)))
+    found = calibrate_keys(clip.PITCH, keys, clip.SIZE, {}, settings, "clip")
+    assert not found.refused
+    # The third marking is the far touch line, and the camera is near.
+    assert np.sign(found.camera.center[1]) == (np.sign(mean) if names == 2 else -1.0)
+
+
 def test_a_survey_without_errors_leaves_its_points_in_place():
     places = {name: tuple(at.tolist()) for name, at in clip.PITCH.points.items() if "left" in name}
     surveyed = PitchTemplate.from_spec(PitchSpec(points=places))
