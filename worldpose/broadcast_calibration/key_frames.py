@@ -41,6 +41,7 @@ from worldpose.static_calibration.sides import (
     MIN_EVIDENCE,
     SeenPeople,
     compare_sides,
+    turn_name,
 )
 from worldpose.tracking.plane.feet import locate_feet
 
@@ -261,14 +262,35 @@ def _calibrate_each(
     settings: BroadcastCalibrationSettings,
     where: str,
 ) -> tuple[dict[int, StaticCalibration], dict[int, str]]:
-    """Return each key frame's camera from its clicks alone, and why others have none, by frame."""
+    """Return each key frame's camera from its clicks alone, and why others have none, by frame.
+
+    Where clicks do not tell the side of the pitch, other key frames do, or else the prior.
+    """
     found: dict[int, StaticCalibration] = {}
     refused: dict[int, str] = {}
-    for frame, key in clicked.items():
-        place = f"{where}: frame {key.frame}"
+    prior = settings.prior
+    near: Floats | None = None  # nearer than its own deviation, a mean tells no side
+    if np.hypot(*prior.center_m[:2]) > max(prior.center_std_m[:2]):
+        near = np.array(prior.center_m)
+
+    def tells_no_side(frame: int) -> bool:
+        markings = clicked[frame].markings
+        return all(
+            turn_name(each.name) == each.name for each in (*markings.points, *markings.drawn)
+        )
+
+    for frame in sorted(clicked, key=tells_no_side):
+        key = clicked[frame]
+        if found:
+            near = np.median([each.estimate.camera.center for each in found.values()], axis=0)
         try:
             found[frame] = calibrate_camera(
-                pitch, key.markings, image_size, settings=settings.key_frame, where=place
+                pitch,
+                key.markings,
+                image_size,
+                settings=settings.key_frame,
+                where=f"{where}: frame {key.frame}",
+                start=near,
             )
         except (InputError, DegenerateError) as error:
             refused[frame] = f"{error}"
@@ -279,7 +301,7 @@ def _calibrate_each(
             found="; ".join(refused.values()) or "no key frame",
             todo="Click points in frames that show an area's corners or the centre circle.",
         )
-    return found, refused
+    return dict(sorted(found.items())), refused
 
 
 def _share_center(estimates: Sequence[CameraEstimate]) -> MovingCamera:

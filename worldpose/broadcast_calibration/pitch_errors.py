@@ -105,7 +105,9 @@ class PitchErrors:
 
     def rescale(self, points: PointEvidence, before: PitchErrors) -> PointEvidence:
         """Return evidence of other errors of the same pitch with the spreads of these."""
-        ratio = np.append(self.point_m / before.point_m, 1.0)  # -1 = none
+        # A survey has one deviation, which may be 0.
+        ratio = np.where(self.surveyed, 1.0, self.paint_m / before.paint_m)
+        ratio = np.append(ratio, 1.0)  # -1 = none
         return replace(points, shares=points.shares * ratio[points.ends])
 
     def learn_paint(self, offsets: Floats, variance: Floats, points: Integers) -> PitchErrors:

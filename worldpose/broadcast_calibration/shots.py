@@ -91,7 +91,7 @@ def find_shots(pictures: Iterable[tuple[int, Image | None]], fps: float) -> Iter
     shot_before: int | None = None
     count = 0
     for number, picture in chain(pictures, [(0, None)]):  # the end ends a shot
-        if number % stride:
+        if picture is not None and number % stride:
             continue
         same, moved = (False, 0.0) if before is None else _measure_motion(before, picture)
         if course is not None and not same:
@@ -161,7 +161,8 @@ def _shot(course: _Course, before: int | None, after: int | None, fps: float, st
     min_duration_s = 4.0
     count = course.last - course.first + 1
     grass, tallest = float(np.median(course.grass)), float(np.median(course.tallest))
-    pan, seconds = course.right - course.left, count / fps
+    # The shot may last until just before the next sample.
+    pan, seconds = course.right - course.left, (count + stride - 1) / fps
     # Neighbouring samples are a stride apart, in a shot and across a cut.
     wipe = 0.1 * fps + stride
     sides = (

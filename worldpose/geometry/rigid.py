@@ -45,10 +45,6 @@ def orthonormal_frame(first: Floats, second: Floats) -> Floats:
     return np.stack([along, cross(third, along), third], axis=-1)
 
 
-# Six decimals, truncated rather than rounded, put at most 2 sqrt(3) 1e-6 into rotation^T rotation.
-# Rotations with all digits of float64 read back within this error and need no correction.
-
-
 @dataclass(frozen=True, eq=False)
 class Rigid:
     """The transform `x_b = rotation x_a + translation`, named `b_from_a`.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import compress
+
 import numpy as np
 
 from data_contracts.arrays import Floats, Image
@@ -10,7 +12,13 @@ from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
-from worldpose.static_calibration.evidence import ClickEvidence, check_amount, gather_evidence
+from worldpose.static_calibration.click_outliers import Explanation
+from worldpose.static_calibration.evidence import (
+    ClickEvidence,
+    check_amount,
+    describe_clicks,
+    gather_evidence,
+)
 from worldpose.static_calibration.explanations import (
     check_determined,
     find_explanation,
@@ -23,6 +31,7 @@ from worldpose.static_calibration.lens_choice import choose_lens, widen_by_lense
 from worldpose.static_calibration.line_refinement import refine_and_judge
 from worldpose.static_calibration.report import StaticCalibration, build_report
 from worldpose.static_calibration.settings import StaticCalibrationSettings
+from worldpose.static_calibration.sides import turn_camera, turn_name
 
 
 def calibrate_camera(
@@ -34,7 +43,7 @@ def calibrate_camera(
     settings: StaticCalibrationSettings | None = None,
     where: str = "clicked markings",
     lens: LensCalibration | None = None,
-    start: Camera | None = None,
+    start: Camera | Floats | None = None,
 ) -> StaticCalibration:
     """Return the camera of an image, its covariance and its report.
 
@@ -51,14 +60,14 @@ def calibrate_camera(
         settings: noise, prior and thresholds; the defaults if None.
         where: file or camera, for messages.
         lens: a calibrated lens, the prior; k1, k2 and k3 are then solved for. None = not known.
-        start: a camera near the answer, which replaces stage 1. Where the markings are their own
-            image after half a turn, it decides the side.
+        start: a camera near the answer, which replaces stage 1, or (3,) its rough place [m], world.
+            Where the markings are their own image after half a turn, either decides the side.
 
     Raises:
         InputError: `method` is `paper`, `start` images no click, the lens is of another image size,
             a name is unknown, a pixel lies outside the image, names are mirrored, the clicks
-            contradict each other, or they do not determine the camera; the message says which
-            clicks to add.
+            contradict each other, or they do not determine the camera or its side; the message
+            says which clicks to add.
 
     Note:
         Paper section "Static Camera Calibration".
@@ -76,18 +85,29 @@ def calibrate_camera(
     stated = stated.model_copy(update={"prior": stated.prior.beside(pitch.spec), **own})
     evidence = gather_evidence(pitch, clicked, image_size, stated.sample_spacing_m, where)
     check_amount(evidence, pitch, where)
-    if start is not None:
+    if isinstance(start, Camera):
         _check_start(start, evidence, where)
     problem = build_problem(evidence, image_size, stated, where=where, lens=lens)
 
     def begin(problem: CameraProblem) -> Floats:
-        if start is None:
-            return find_start(problem, stated)
-        return fit_from_starts(problem, start.numbers[None], stated.wrong_click)[0]
+        if isinstance(start, Camera):
+            return fit_from_starts(problem, start.numbers[None], stated.wrong_click)[0]
+        return find_start(problem, stated)
 
     found = choose_lens(fit_level_or_rolled(problem, begin, stated), stated)
     found = find_explanation(found, pitch, stated)
     check_determined(found, pitch)
+    if not isinstance(start, Camera) and not _tells_side(found):
+        return calibrate_camera(
+            pitch,
+            clicked,
+            image_size,
+            picture=picture,
+            settings=settings,
+            where=where,
+            lens=lens,
+            start=_choose_side(found, pitch, start),
+        )
     found = try_k3(found)
     lines = None
     if picture is not None and stated.lines:
@@ -99,6 +119,29 @@ def calibrate_camera(
         estimate, pitch = lines.estimate.estimate, pitch.with_surface(lines.estimate.surface)
     report = build_report(estimate, found, lines, pitch, stated.click_noise_px)
     return StaticCalibration(estimate, report)
+
+
+def _tells_side(found: Explanation) -> bool:
+    """Return whether names of inliers are those of other markings after half a turn."""
+    evidence, fit = found.problem.evidence, found.fit
+    names = (*compress(evidence.points, fit.inliers), *compress(evidence.markings, fit.markings))
+    return any(turn_name(name) != name for name in names)
+
+
+def _choose_side(found: Explanation, pitch: PitchTemplate, place: Floats | None) -> Camera:
+    """Return the camera, or itself after half a turn, on the side of a place (3,) [m]."""
+    camera = found.estimate.camera
+    if place is not None and (along := float(camera.center[:2] @ place[:2])) != 0.0:
+        return turn_camera(camera) if along < 0.0 else camera
+    names = [name for name in pitch.points if turn_name(name) != name]
+    names.sort(key=lambda name: float(np.linalg.norm(pitch.points[name])))
+    raise InputError(
+        found.problem.where,
+        expected="clicks that tell the side on which the camera stands",
+        found=f"{describe_clicks(found.problem.evidence)}, which look the same from both sides",
+        todo="Click one more point or marking with a side in its name, such as "
+        f"{names[0]} or {names[1]}.",
+    )
 
 
 def _check_start(start: Camera, evidence: ClickEvidence, where: str) -> None:

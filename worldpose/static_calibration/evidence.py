@@ -10,6 +10,7 @@ import numpy as np
 from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
+from worldpose.geometry.rigid import unit
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.ground_error import points_off_line
 
@@ -214,8 +215,12 @@ def check_amount(evidence: ClickEvidence, pitch: PitchTemplate, where: str) -> N
         pixels = int((evidence.drawn_marking == index).sum())
         # An arc has five constraints of its ellipse, less one for the rotation of the circle.
         numbers += min(pixels, 2 if evidence.straight[index] else 4)
+    firsts, stops = evidence.bounds[:-1], evidence.bounds[1:]
+    ways = unit(evidence.samples_world[stops - 1] - evidence.samples_world[firsts])
+    # Along parallel lines alone, a camera slides.
+    slides = not points and evidence.straight.all() and np.linalg.matrix_rank(ways, tol=0.1) < 2
     # The pose; the prior holds the focal length.
-    if numbers < 6:
+    if numbers < 6 or slides:
         places = np.concatenate([evidence.points_world, evidence.samples_world])
         more = points_off_line(pitch, places)
         raise InputError(

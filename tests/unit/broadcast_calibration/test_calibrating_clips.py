@@ -336,6 +336,17 @@ def test_only_live_pans_of_the_main_camera_are_proposed(found):
     assert "shorter than 4 s" in said["short"]
 
 
+@pytest.mark.parametrize(("damaged", "parts"), [(None, [(0, 199)]), (101, [(0, 101), (102, 97)])])
+def test_a_fast_video_has_the_shots_of_all_its_frames(damaged, parts):
+    # Four seconds at 50 frames per second, of which every other one is looked at.
+    noise = np.random.default_rng(0).integers(40, 120, (18, 52, 3), dtype=np.uint8)
+    ground = cv2.resize(noise, (520, 180), interpolation=cv2.INTER_NEAREST)
+    pictures = [None if n == damaged else ground[:, n : n + 320].copy() for n in range(200)]
+    found = list(find_shots(enumerate(pictures), 50.0))
+    assert [(shot.first, shot.count) for shot in found] == parts
+    assert ["shorter than 4 s" in shot.unfit for shot in found] == [len(parts) > 1] * len(parts)
+
+
 def test_a_stretch_is_cut_out_picture_for_picture(programme, tmp_path):
     video, cut = tmp_path / "programme.mp4", tmp_path / "cut.mp4"
     write_video(video, programme[1][:90], SHOT_FPS)

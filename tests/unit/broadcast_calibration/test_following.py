@@ -9,11 +9,13 @@ import turning_clip as clip
 from pydantic import ValidationError
 
 from data_contracts.broadcast_calibration import KeyFrame
+from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.broadcast_calibration.clip_problem import ClipProblem, TermWeights
-from worldpose.broadcast_calibration.evidence import FlowEvidence, PointEvidence
+from worldpose.broadcast_calibration.evidence import FlowEvidence, PointEvidence, whiten_points
 from worldpose.broadcast_calibration.key_frames import calibrate_keys
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
+from worldpose.broadcast_calibration.pitch_errors import PitchErrors
 from worldpose.broadcast_calibration.players import People, estimate_feed_offset
 from worldpose.broadcast_calibration.priors import build_prior
 from worldpose.broadcast_calibration.residuals import linearize
@@ -34,6 +36,7 @@ from worldpose.errors import DegenerateError, InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.lens_models import LensModel
 from worldpose.ingest.clock import ImageClock, rows_at
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.scene import look_at
 from worldpose.static_calibration.estimate import calibrate_camera
 
@@ -91,6 +94,40 @@ def test_key_frames_of_a_wide_lens_keep_the_model_of_the_clip():
     places = clip.PITCH.positions(list(pixels))
     off = np.linalg.norm(found.camera.camera[0].project(places) - true.project(places), axis=1)
     assert off.max() < 9.0  # k1, k2 and k3 of the fisheye, read as Brown's: over 300 px
+
+
+@pytest.mark.parametrize(("mean", "names"), [(-75.0, 2), (75.0, 2), (75.0, 3)])
+def test_key_frames_stand_on_the_side_of_the_others_or_else_of_the_prior(mean, names):
+    true, rng = clip.moving(2, pan=(-2.0, 6.0)), np.random.default_rng(2)
+    drawn = [clip.draw(true, 0, 1.0, rng)[:2], clip.draw(true, 1, 1.0, rng)[:names]]
+    keys = [
+        KeyFrame(frame=n, markings=ClickedMarkings.model_validate({"points": [], "drawn": each}))
+        for n, each in enumerate(drawn)
+    ]
+    settings = BroadcastCalibrationSettings(prior=BroadcastPrior(center_m=(0.0, mean, 17.0)))
+    found = calibrate_keys(clip.PITCH, keys, clip.SIZE, {}, settings, "clip")
+    assert not found.refused
+    # The third marking is the far touch line, and the camera is near.
+    assert np.sign(found.camera.center[1]) == (np.sign(mean) if names == 2 else -1.0)
+
+
+def test_a_survey_without_errors_leaves_its_points_in_place():
+    places = {name: tuple(at.tolist()) for name, at in clip.PITCH.points.items() if "left" in name}
+    surveyed = PitchTemplate.from_spec(PitchSpec(points=places))
+    before = PitchErrors.of(surveyed, BroadcastCalibrationSettings(survey_error_m=0.0))
+    ends = np.stack([np.arange(len(surveyed.points)), np.full(len(surveyed.points), -1)], axis=1)
+    points = PointEvidence.observe(
+        0,
+        np.zeros(len(ends), dtype=np.int64),
+        surveyed.positions(list(surveyed.points)),
+        np.zeros((len(ends), 2)),
+        whiten_points(np.ones(len(ends))),
+        loss=np.inf,
+    )
+    first = before.apply(points, ends, np.ones(ends.shape))
+    again = replace(before, shown_m=0.5 * before.shown_m).rescale(first, before).shares
+    expected = np.where(before.surveyed, 0.0, 0.5 * before.paint_m)
+    np.testing.assert_allclose(again, np.stack([expected, np.zeros(len(ends))], axis=1))
 
 
 def test_a_turn_and_a_zoom_are_found_among_movers():

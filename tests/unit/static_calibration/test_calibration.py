@@ -69,6 +69,18 @@ def test_a_start_is_one_camera_that_looks_at_the_markings():
             calibrate_camera(PITCH, clicked, SIZE, start=start)
 
 
+def test_a_place_decides_the_side_of_markings_that_both_sides_see_alike():
+    camera = people.pinhole((0.0, -75.0, 18.0), (0.0, 0.0, 0.0), 2100.0, SIZE)
+    rng = np.random.default_rng(2)
+    drawn = people.draw(camera, ["center_circle", "halfway_line"], rng, count=10, noise=1.0)
+    clicked = ClickedMarkings(drawn=drawn)
+    with pytest.raises(InputError, match=r"the same from both sides.*center_circle_near"):
+        of(clicked)
+    for side in (-1.0, 1.0):
+        found = calibrate_camera(PITCH, clicked, SIZE, start=np.array([5.0, 60.0 * side, 20.0]))
+        np.testing.assert_allclose(found.estimate.camera.center[1], 75.0 * side, rtol=0.2)
+
+
 def test_three_points_are_too_few_and_the_message_names_others():
     camera, _ = people.seat(0)
     three = dict(list(people.visible(camera).items())[:3])
@@ -110,6 +122,14 @@ def test_corners_and_only_the_line_through_them_do_not_determine_a_camera():
     drawn = people.draw(camera, ["goal_line_left"], rng)
     with pytest.raises(InputError, match=r"leave \d of its 7 degrees of freedom open"):
         of(ClickedMarkings(points=clicked.points, drawn=drawn))
+
+
+def test_parallel_lines_alone_do_not_tell_where_along_them_a_camera_stands():
+    camera = people.pinhole((-30.0, -70.0, 18.0), (-40.0, 0.0, 0.0), 3000.0, SIZE)
+    names = ["penalty_area_left_front", "goal_line_left", "goal_area_left_front"]
+    drawn = people.draw(camera, names, np.random.default_rng(0), noise=1.0)
+    with pytest.raises(InputError, match="three straight markings in two directions"):
+        of(ClickedMarkings(drawn=drawn))
 
 
 def test_left_and_right_exchanged_is_told_from_wrong_clicks():
