@@ -37,6 +37,11 @@ StateName = Literal[
 ]
 UNREADABLE: Final = "cannot be opened"
 """Words of a match that cannot be opened or planned."""
+NEEDS_FILES: Final = (
+    "Add files: 2D poses of another tool, another calibration, or other offsets of the cameras. "
+    "A run then begins by itself; no answer makes these results usable."
+)
+"""What to do about results that are not usable."""
 START_SECONDS: Final = 10.0
 """Time until a run computes: its processes start [s]."""
 
@@ -112,6 +117,8 @@ def _find(
             words = _count(len(rejected), "result was rejected", "results were rejected")
             return MatchState("questions", words, todo="Correct it, then run again.")
         words = _count(len(waiting) - len(rejected), "question", "questions")
+        if latest is not None and _are_people_lost(latest):
+            return MatchState("questions", f"not usable, {words}", todo=NEEDS_FILES)
         return MatchState("questions", words, todo="Answer, then the run goes on by itself.")
     if stopped:
         why = f"Run {stopped} ended before it was recorded; its finished steps are kept."
@@ -139,7 +146,16 @@ def _find(
     usability = latest.usability
     words = "ready" if usability.verdict == "usable" else usability.verdict
     why = " ".join(usability.reservations)
-    return MatchState("ready", words, why, todo="Download the results.")
+    todo = NEEDS_FILES if usability.verdict == "not usable" else "Download the results."
+    return MatchState("ready", words, why, todo)
+
+
+def _are_people_lost(latest: RunRecord) -> bool:
+    """Return whether no answer makes the results of a run usable: its tracks miss most people."""
+    most = latest.usability.limits.max_unusable_share
+    tracked = [own for unit, own in latest.figures.items() if unit.startswith("tracking/")]
+    shares = ("absent_share", "unmatched_share")
+    return any(own.get(name, 0.0) > most for own in tracked for name in shares)
 
 
 def _open_runs(store: Store, match_id: str, latest: RunRecord | None) -> tuple[bool, str]:

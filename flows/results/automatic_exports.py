@@ -22,13 +22,14 @@ def export_after_run(store: Store, match: Match, record: RunRecord) -> list[Path
     if not settings.exports or record.state not in ("complete", "partial"):
         return []
     from flows.results.best_results import Origin, find_clips  # late: few runs are exported
-    from flows.results.export import export, forms_without_people
+    from flows.results.export import export
+    from flows.results.possible_exports import impossible_exports
 
     origin, forms = Origin(Run(store, record), match.registration), list(settings.exports)
     if not find_clips(record):
-        possible = forms_without_people(origin.run, origin.spec)
-        forms = [form for form in settings.exports if form in possible]
-        left = [form for form in settings.exports if form not in possible]
+        lacking = impossible_exports(origin.run, origin.spec)
+        forms = [form for form in settings.exports if form not in lacking]
+        left = [form for form in settings.exports if form in lacking]
         if left:
             reporter().say(f"run {record.run_id} has no people yet: no export of {', '.join(left)}")
         if not forms:

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from data_contracts.arrays import Floats
-from data_contracts.match import MatchSpec
 from data_contracts.pin import Pin
 from data_contracts.release import BaselineSettings, ReleasedClip, ReleaseManifest
 from flows.results import best_results
@@ -23,7 +22,6 @@ from flows.results.run_cameras import (
     broadcast_views,
     estimated_pitch,
     moving_cameras,
-    static_cameras,
     view_changes,
     with_brown_lenses,
 )
@@ -46,7 +44,7 @@ from worldpose.ingest.footage import image_clock, unit_frames
 from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.runs import pin_run, read_pin
-from worldpose.store.store import Run, Store
+from worldpose.store.store import Store
 from worldpose.video.files import write_video
 
 CAMERA_CHANGES = "camera_changes"
@@ -303,9 +301,10 @@ def export(
             tracks = origin.tracks(clip)
             written.append(place / "origins" / f"{clip}.npz")
             manifests.write_origins(written[-1], tracks, manifests.origins_of(tracks))
-        if not COUNTED & set(forms):
+        clips = best_results.all_clips(origin.run)
+        if not clips or not COUNTED & set(forms):
             return written
-        rates = dict.fromkeys(best_results.all_clips(origin.run), origin.spec.fps)
+        rates = dict.fromkeys(clips, origin.spec.fps)
         return [*written, manifests.write_frame_rates(place, rates)]
 
     match_id = origin.spec.match_id
@@ -321,13 +320,6 @@ def export(
         )
 
     return write_whole(out, write, claim)
-
-
-def forms_without_people(run: Run, spec: MatchSpec) -> tuple[str, ...]:
-    """Return the formats for which a run has results even if it has no people."""
-    if broadcast_views(run):
-        return OF_CAMERAS
-    return OF_CAMERAS[:1] if static_cameras(run, spec) else ()
 
 
 def _file_for_folder(out: Path, forms: list[str]) -> UsageError:

@@ -106,18 +106,19 @@ class MatchRuns(PrefectApi):
         found = (self.list_all("flow_runs", flow_runs={"id": {"any_": each}}) for each in some)
         return {run["id"]: run for each in found for run in each}
 
-    def cancel(self, run: QueuedRun, why: str) -> None:
-        """End a run, or take it out of the queue.
+    def cancel(self, run: QueuedRun, why: str) -> bool:
+        """End a run, or take it out of the queue; return False if it has ended.
+
+        The queue decides: a process that has read Prefect's state would overwrite it. The worker
+        ends the process of a run that the queue calls cancelled.
 
         Raises:
             UnreachablePrefectError: Prefect does not answer.
         """
-        is_known = self.find(f"/flow_runs/{run.flow_run}") is not None
-        if is_known:
-            end = "CANCELLING" if run.state == "begun" else "CANCELLED"
-            self.set_state(run.flow_run, end, why)
-        if run.state != "begun" or not is_known:
-            self.queue.change(run, "cancelled", why)
+        ended = self.queue.cancel(run, why)
+        if ended is not None and self.find(f"/flow_runs/{ended.flow_run}") is not None:
+            self.set_state(ended.flow_run, "CANCELLED", why)
+        return ended is not None
 
     def link(self, run: QueuedRun) -> str:
         """Return the page of a run in Prefect's dashboard."""

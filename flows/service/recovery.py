@@ -105,8 +105,9 @@ def adopt_due(runs: MatchRuns) -> None:
             except (InputError, ValueError) as error:  # as a parameter that is no JSON
                 runs.set_state(run["id"], "FAILED", f"it cannot be taken: {error}")
             continue
-        if ended.state == "failed" and run["state_type"] == "RUNNING":
-            runs.set_state(run["id"], "CRASHED", ended.message)  # else it would keep its place
+        if ended.state in ("failed", "cancelled") and run["state_type"] == "RUNNING":
+            kind = "CRASHED" if ended.state == "failed" else "CANCELLED"
+            runs.set_state(run["id"], kind, ended.message)  # else it would keep its place
             continue
         is_retried = ended.state in ENDED and run["state_type"] == "SCHEDULED"
         if is_retried and parse_time(run["state"]["timestamp"]) > ended.changed_at:
@@ -167,16 +168,19 @@ def _start_again(
     if asked is None:
         return
     LOG.warning("%s: %s; it restarts", run.name, why)
+    flow_run = run.flow_run
     if there is not None and not is_former:
-        runs.set_state(run.flow_run, "SCHEDULED", why, "AwaitingRetry")
-        return
-    key = f"queue-{run.id}.{asked.number}"
-    created = runs.create_run(run.flow, run.name, run.parameters, run.priority, key)
-    runs.queue.change(asked, "asked", why, flow_run=created["id"])
+        runs.set_state(flow_run, "SCHEDULED", why, "AwaitingRetry")
+    else:
+        key = f"queue-{run.id}.{asked.number}"
+        flow_run = runs.create_run(run.flow, run.name, run.parameters, run.priority, key)["id"]
+        runs.queue.change(asked, "asked", why, flow_run=flow_run)
     if is_former:
         runs.set_state(
             run.flow_run, "CANCELLED", f"{former}; a run with the new ones stands for it"
         )
+    if (now := runs.queue.latest(asked)).state == "cancelled":  # meanwhile, by a person
+        runs.set_state(flow_run, "CANCELLED", now.message)
 
 
 def _is_stuck(

@@ -14,6 +14,7 @@ from uuid import UUID
 
 import httpx
 from prefect.client.orchestration import get_client
+from prefect.client.schemas.objects import FlowRun
 from prefect.engine import handle_engine_signals
 from prefect.exceptions import Abort, ObjectNotFound, Pause
 from prefect.flow_engine import run_flow
@@ -23,6 +24,7 @@ from flows.orchestration.prefect_api import UnreachablePrefectError
 from flows.service import deployed
 from flows.service.child import end_with_parent
 from flows.service.run_queue import beating, queue_of_parameters, queued_run
+from worldpose.store.run_queue import ENDED
 from worldpose.store.store import Store
 
 LOST: Final = (LostWorkersError, UnreachablePrefectError, ObjectNotFound, httpx.HTTPError)
@@ -34,9 +36,15 @@ def main(flow: str, run_id: UUID) -> None:
     with handle_engine_signals(run_id):
         with get_client(sync_client=True) as client:
             at_prefect = client.read_flow_run(run_id)
-        queue = queue_of_parameters(at_prefect.parameters)
-        run = queue.take(queued_run(flow, at_prefect.model_dump(mode="json")))
-        run = queue.begin(run, str(run_id))
+            queue = queue_of_parameters(at_prefect.parameters)
+            run = queue.take(queued_run(flow, at_prefect.model_dump(mode="json")))
+            states = client.read_flow_run_states(run_id) if run.state in ENDED else []
+        if any(each.is_scheduled() and each.timestamp > run.changed_at for each in states):
+            queue.change(run, "asked", "retried at Prefect")
+        begun = None if _is_off(at_prefect) else queue.begin(run, str(run_id))
+        if begun is None:  # it was cancelled after the worker took it
+            raise Abort
+        run = begun
         try:
             known = Store(queue.blobs).registration(run.match_id) if run.match_id else None
             with beating(queue, run, None if known is None else Path(known.folder)):
@@ -53,6 +61,11 @@ def main(flow: str, run_id: UUID) -> None:
             queue.change(run, "failed", str(error) or type(error).__name__)
             raise
         queue.change(run, "complete")
+
+
+def _is_off(at_prefect: FlowRun) -> bool:
+    state = at_prefect.state
+    return state is not None and (state.is_cancelled() or state.is_cancelling())
 
 
 if __name__ == "__main__":

@@ -158,10 +158,12 @@ class ServedWorker(BaseWorker[_OwnJob, BaseVariables, BaseWorkerResult]):
                 LOG.debug("run %r: %s", flow_run.name, error)
             run = await to_thread.run_sync(queue.latest, first)
             is_open = run.number == first.number or (run.state, run.pid) == ("begun", process.pid)
-            if kind == StateType.CANCELLING or (run.state == "cancelled" and code is None):
-                await _end(process)
-                cancelled: State[Any] = Cancelled()
-                await self.client.set_flow_run_state(flow_run.id, cancelled, force=True)
+            if kind == StateType.CANCELLING or run.state == "cancelled":
+                if code is None:
+                    await _end(process)
+                with suppress(Exception):  # without a server, the queue alone knows it
+                    cancelled: State[Any] = Cancelled(message=run.message or why)
+                    await self.client.set_flow_run_state(flow_run.id, cancelled, force=True)
                 code, kind = 0, StateType.CANCELLED
             if code is not None and is_open:
                 if kind == StateType.CANCELLED:

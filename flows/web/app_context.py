@@ -213,10 +213,9 @@ class Continuing:
             if served is None:
                 return self._local.cancel(match_id, who)
             self._seen = None
+            why = f"cancelled on the page of the match by {who}"
             own = _open_runs(served, match_id)
-            for run in own:
-                served.cancel(run, f"cancelled on the page of the match by {who}")
-            return bool(own)
+            return [served.cancel(run, why) for run in own].count(True) > 0
 
     def state(self, match_id: str) -> dict[str, Any] | None:
         """Return the state of the match's run, or of the last one if it failed or was cancelled."""
@@ -410,9 +409,9 @@ class LocalRuns:
         with self._lock:
             waits = match_id in dict(self._waiting)
             self._waiting = [each for each in self._waiting if each[0] != match_id]
-            is_at_work = match_id == self._at_work and self._process is not None
-            if is_at_work and self._process is not None:
+            if is_at_work := match_id == self._at_work:
                 self._cancelled_by = who
+            if is_at_work and self._process is not None:
                 os.killpg(self._process.pid, signal.SIGINT)
                 # Some ignore it, as what is started in the background of a script.
                 later = Timer(PATIENCE_SECONDS, _terminate, [self._process])
@@ -428,7 +427,7 @@ class LocalRuns:
             except Exception as error:  # any, so that the other runs have their turn
                 ended = 1, f"The run could not be started: {error}"
             with self._lock:
-                self._process = None
+                self._process, self._cancelled_by = None, ""
                 self._ended[match_id], self._output = (*ended, datetime.now(UTC)), None
                 if not self._waiting:
                     self._at_work = None
@@ -455,7 +454,9 @@ class LocalRuns:
                 env=without_secrets(os.environ, keep=STORE_SECRETS),
             )
         with self._lock:
-            self._process, self._cancelled_by = process, ""
+            self._process = process
+            if self._cancelled_by:  # before it was there
+                os.killpg(process.pid, signal.SIGKILL)
         code = process.wait()
         # Before the command handles it, the signal of `cancel` ends the process or Python's start.
         if code != 0 and self._cancelled_by:

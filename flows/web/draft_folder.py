@@ -20,13 +20,14 @@ import yaml
 from pydantic import JsonValue
 
 from data_contracts.match import MatchSpec
-from flows.layers import pitch_in_words
+from flows.layers import pitch_in_words, read_layers
 from flows.method import METHOD
 from flows.registering import register_next
 from flows.review.corrections import corrected_match
 from flows.run_record import expected_work, latest_run
 from flows.run_status import plan_as_latest
 from flows.service.inbox import SUMS
+from flows.settings import resolve
 from flows.web.draft_problems import (
     GIVEN,
     Index,
@@ -40,6 +41,7 @@ from worldpose.errors import InputError
 from worldpose.formats.files import read_yaml
 from worldpose.ingest.footage import uncovered_clips
 from worldpose.ingest.match_folder import MatchFolder, read_match, read_spec
+from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.ingest.registration import register_match
 from worldpose.ingest.validation import reachable
 from worldpose.store.store import Store
@@ -156,6 +158,7 @@ def build(
         match = read_match(folder, (), *pitch_in_words(store, folder, read_spec(folder)))
         if match_id is None or taken:  # else 2D poses of hours would be read at each change
             notes += uncovered_clips(match)
+        notes += _doubt_detector(store, match)
     except InputError as error:
         return [describe(error, folder, given)], notes
     owners = {*(each.id for each in match.spec.cameras), *match.spec.broadcast_views}
@@ -176,6 +179,20 @@ def build(
         )
         problems.append({"place": "", "message": said})
     return problems, notes
+
+
+def _doubt_detector(store: Store, match: MatchFolder) -> list[str]:
+    """Return a warning if the bundled nets, made for a pitch, would detect the people of a lab."""
+    given = match.detections.keys() >= match.videos.keys()
+    if match.spec.pitch != NO_PITCH or given:
+        return []
+    if "detection.detector" in resolve(read_layers(store, match.spec)).differences():
+        return []
+    return [
+        "warning: no 2D poses are given, so the run detects people in the videos. The bundled nets "
+        "know people of 28 to 160 px, and miss taller ones. Add 2D poses of another tool, or state "
+        "detection.detector and detection.pose in the settings."
+    ]
 
 
 def registered_as(store: Store, match: MatchFolder) -> str | None:
@@ -225,13 +242,11 @@ def foresee(store: Store, folder: MatchFolder) -> tuple[list[Problem], list[str]
         return [], [f"Before the next run, {names} must be calibrated on the page of the match."]
     plan = plan_as_latest(store, match, latest, {})
     missing = [unit for unit in plan if not unit.published]
-    units: dict[str, list[str]] = {}
-    for stage, unit in (each.name.split("/", 1) for each in missing):
-        units.setdefault(stage, []).append(unit)
-    about = {stage.name: stage.about for stage in METHOD}
-    listed = "; ".join(f"{about[stage]} ({', '.join(names)})" for stage, names in units.items())
+    begun = {each.name.partition("/")[0] for each in missing}
+    first = next((stage.about for stage in METHOD if stage.name in begun), "")
     seconds = sum(expected_work(store, match, missing, latest).values())
     minutes = max(1, round(seconds / 60 / max(1, os.cpu_count() or 1)))
     kept = len(plan) - len(missing)
-    told = f"The next run computes, in about {minutes} min: {listed}. It keeps {kept} results."
+    told = f"The next run begins with: {first}. It computes {len(missing)} results in about "
+    told += f"{minutes} min, and keeps {kept}."
     return [], [told if missing else "The next run has nothing to compute."]

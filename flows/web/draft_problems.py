@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
+from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any, Final, Literal, TypeAlias, get_args
 
@@ -137,6 +138,15 @@ def camera_sizes(file: Path) -> dict[str, tuple[int, int]]:
             cameras = read_calibration(file, {}, LeftOut(), any_unit=True)
             return {name: camera.image_size for name, camera in cameras.items()}
     return {}
+
+
+@lru_cache(maxsize=1000)
+def calibrated_cameras(file: Path, changed_ns: int) -> list[str]:
+    """Return the cameras of any tool's calibration; none of other files, or of unreadable ones."""
+    with suppress(InputError):
+        if _kind_of(file) == "calibration":
+            return list(read_calibration(file, {}, LeftOut(), any_unit=True))
+    return []
 
 
 def form_problems(

@@ -39,6 +39,7 @@ from flows.web.draft_problems import (
     DraftFile,
     Index,
     Problem,
+    calibrated_cameras,
     camera_sizes,
     choose_name,
     describe_broken,
@@ -395,8 +396,10 @@ class Drafts:
             problem = str(self._work(self._copy, draft_id, file) or "")
             return {**content, "state": "broken" if problem else "copying", "problem": problem}
         if not is_footage(file.name):
-            sizes = camera_sizes(self._whole(draft_id, file))
-            return {**content, "state": "ready", "cameras": sizes}
+            whole = self._whole(draft_id, file)
+            calibrates = calibrated_cameras(whole, whole.stat().st_mtime_ns)
+            sizes = camera_sizes(whole)
+            return {**content, "state": "ready", "cameras": sizes, "calibrates": calibrates}
         index = self._index(draft_id, file)
         if index is None:
             return {**content, "state": "reading"}

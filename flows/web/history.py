@@ -52,6 +52,7 @@ def routes(context: PageContext) -> APIRouter:
             {
                 "id": run_id,
                 "state": record.state,
+                "verdict": record.usability.verdict,
                 "finished_at": record.finished_at,
                 "seconds": record.seconds,
                 "computed": len(record.executed),
@@ -135,6 +136,9 @@ def _find_cause(match: Match, record: RunRecord, parent: RunRecord | None) -> st
     causes = [f"{made} {'correction' if made == 1 else 'corrections'}"] if made > 0 else []
     causes += ["other settings"] if parent.overrides != record.overrides else []
     causes += ["other libraries"] if parent.versions != record.versions else []
+    new = [name for name in record.results if name.startswith("ingest/")]
+    is_new = any(parent.results.get(name) != record.results[name] for name in new)
+    causes += ["new files"] if is_new and not parent.failed and not causes else []
     causes += ["answers to its questions"] if parent.waiting and not causes else []
     causes += ["failed steps again"] if parent.failed and not causes else []
     return ", ".join(causes) or "run again"

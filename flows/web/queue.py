@@ -6,6 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Container, Sequence
 from math import isfinite
+from pathlib import Path
 from typing import Any, Final
 
 from fastapi import APIRouter
@@ -33,6 +34,12 @@ ORDER: Final = (
 )
 """Kinds of states, the most urgent first; the last one is that of a match not read yet."""
 
+_INTAKE: Final = {
+    "state": "running",
+    "is_intake": True,
+    "waits": True,
+    "lines": ["Its files are read, and its run then begins by itself."],
+}
 _ABOUT: Final = {stage.name: stage.about for stage in METHOD}
 
 
@@ -144,7 +151,7 @@ def describe_review(review: Review) -> dict[str, Any]:
 
 def _glance(context: PageContext, found: MatchSummary) -> dict[str, Any]:
     """Return a summary as JSON; while a run of these pages is at work, they show its progress."""
-    at_work = _local_run(context, found.match_id)
+    at_work = _local_run(context, found.match_id) or _intake(context, found)
     found, latest = say_cancelled(found, at_work), found.latest
     elsewhere = {"state": "elsewhere", "lines": [found.open_run]} if found.open_run else None
     return {
@@ -192,6 +199,17 @@ def _local_run(context: PageContext, match_id: str) -> dict[str, Any] | None:
         begin = state["stage"].replace("_", "[_ ]")
         lines = [re.sub(f"^{begin}\\b", about, line) for line in lines]
     return {**state, "lines": lines}
+
+
+def _intake(context: PageContext, found: MatchSummary) -> dict[str, Any] | None:
+    """Return the state of a registered match whose intake has not asked for its run yet."""
+    if found.kind != "new":
+        return None
+    name = Path(context.registration(found.match_id).folder).name
+    for each in served_state(context.store.url).arrivals().values():
+        if each.state == "arriving" and each.name.rpartition("/")[2] == name:
+            return {**_INTAKE}
+    return None
 
 
 def _clip(context: PageContext, match: Match, clip: str) -> dict[str, Any]:

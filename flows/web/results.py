@@ -31,9 +31,9 @@ from flows.results.best_results import (
     tracked_people,
 )
 from flows.results.comparison import SubjectChange, compare_runs, paired_people
-from flows.results.export import POSITION_FORMATS, export, forms_without_people
+from flows.results.export import export
 from flows.results.outputs import OWNERS
-from flows.results.run_cameras import broadcast_views
+from flows.results.possible_exports import impossible_exports
 from flows.review.identities import names_said
 from flows.stage import Match
 from flows.web.app_context import PageContext
@@ -45,8 +45,6 @@ from worldpose.store.runs import LATEST
 from worldpose.store.store import Run, Store
 
 BINARY: Final = "application/octet-stream"
-BROADCAST_FORMATS: Final = ("challenge", "challenge-2025", "tracks", "slahmr-cameras")
-"""Formats of a calibrated broadcast camera."""
 CACHED_FILES: Final = 12
 """Files that are kept; the oldest is removed for a new one."""
 REPORT_POLICY: Final = (
@@ -251,18 +249,15 @@ def _describe_results(context: PageContext, match: Match, run: Run) -> dict[str,
     record = run.record
     clips = find_clips(record)
     lacking = {clip: why_without_joints(run, clip) for clip in clips}
-    is_3d = not clips or None in lacking.values()
-    formats = EXPORT_FORMATS if is_3d else POSITION_FORMATS
-    if not clips:
-        formats = forms_without_people(run, match.folder.spec)
-    if not broadcast_views(run):
-        formats = tuple(form for form in formats if form not in BROADCAST_FORMATS)
+    impossible = impossible_exports(run, match.folder.spec)
+    alone = {} if clips else {"worldpose": "cameras alone: the run has no people yet"}
     return {
         "run": record.run_id,
         "state": record.state,
         "later": describe_later(context.store, record),
-        "formats": list(formats),
-        "purposes": EXPORT_PURPOSES,
+        "formats": [form for form in EXPORT_FORMATS if form not in impossible],
+        "impossible": impossible,
+        "purposes": {**EXPORT_PURPOSES, **alone},
         "clips": [
             {"id": clip, "video": clip_view(run, match, clip), "without_joints": lacking[clip]}
             for clip in clips

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, Final
 
 from fastapi import APIRouter, HTTPException
 from pydantic import JsonValue
@@ -22,11 +23,13 @@ from flows.layers import (
     read_layers,
     say_unnamed_venues,
 )
-from flows.settings import known_settings, resolve, save_layer
+from flows.settings import LIST, known_settings, resolve, save_layer
 from flows.web.app_context import PageContext
 from worldpose.errors import InputError
 from worldpose.store.paths import is_name
 from worldpose.store.runs import alone
+
+ON_PAGE: Final = "The page lists the names as you type, and what each of them takes."
 
 
 class SavedLayer(Record):
@@ -57,7 +60,7 @@ def routes(context: PageContext) -> APIRouter:
         try:
             in_force = resolve(layers).differences()
         except InputError as error:  # the page is where it is corrected
-            problem = str(error)
+            problem = str(_on_page(error, layers))
         names = [PROJECT, *(f"{VENUES}/{each}" for each in list_venues(store))]
         names += [] if match is None else [match_layer(match)]
         return {
@@ -95,9 +98,21 @@ def routes(context: PageContext) -> APIRouter:
                 found=repr(changed[key]),
                 todo=f"On the server: worldpose settings --set {key}=...",
             )
-        save_layer(store, layers_of(match), given.layer, given.values)
+        layers = layers_of(match)
+        try:
+            save_layer(store, layers, given.layer, given.values)
+        except InputError as error:
+            raise _on_page(error, (before, *layers)) from error
 
     return router
+
+
+def _on_page(error: InputError, layers: Iterable[Layer]) -> InputError:
+    """Return an error that names layers as the page does, and says what its reader can do."""
+    where, todo = error.where, error.todo.replace(LIST, ON_PAGE)
+    for layer in layers:
+        where = where.replace(layer.file, f"settings of the {layer.origin}")
+    return InputError(where, error.expected, error.found, todo)
 
 
 def _names_file(key: str, value: JsonValue) -> bool:

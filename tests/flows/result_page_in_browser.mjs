@@ -34,8 +34,8 @@ await page.click(".people button >> nth=0");
 await page.waitForTimeout(500);
 await shoot(page, "follow");
 // A download that cannot be written says why on this page.
-await page.route("**/exports/usd?*", (route) => route.fulfill({ status: 422, json: { error: "needs the extra usd" } }));
-await page.click("[data-downloads] a >> text=/^usd$/");
+await page.route("**/exports/bvh?*", (route) => route.fulfill({ status: 422, json: { error: "needs the extra usd" } }));
+await page.click("[data-downloads] a >> text=/^bvh$/");
 seen.refused = await page.locator("[role=alert] >> text=needs the extra").innerText();
 seen.pages = page.context().pages().length;
 await page.click("text=Dismiss");

@@ -44,19 +44,21 @@ const matchOf = (run, reviews) => ({
 });
 const resultsOf = (run) => ({
   run, state: "complete", later: "", formats: ["csv", "usd", "c3d"], purposes: { csv: "", usd: "", c3d: "" },
+  impossible: { minimap: "The match has no pitch." },
   clips: [{ id: "half", video: null, without_joints: null }],
 });
 const trackOf = (id, name) => ({ id, name, seen: { north: 1 }, segments: [[100, 299]], views: 2, way: [[0, 0]] });
 
 // A new run while the page is open; two names at once; two downloads at once.
 async function showNewRun() {
-  let [run, slow] = ["0001", 0];
+  let [run, slow, broken] = ["0001", 0, []];
   const [asked, names, sent, written, crops, merged] = [[], {}, [], [], [], []];
   await at_server("match/final", async (path, search, body) => {
     if (path.includes("/scenes/")) asked.push(search);
     if (path.includes("/scenes/")) return [500, { error: "stub" }];
     if (path.includes("/exports/")) written.push(`${path.split("/").at(-1)}${search}`);
     if (path.includes("/exports/")) await wait(0.5);
+    if (broken.some((form) => path.endsWith(form))) return [422, { error: "no disk ".repeat(60) }];
     if (path === "/api/session") return session;
     if (path === "/api/matches/final") return matchOf(run, []);
     if (path.endsWith("/results")) return resultsOf(run);
@@ -91,6 +93,21 @@ async function showNewRun() {
   for (const form of ["usd", "c3d"]) await page.click(`[data-downloads] a >> text=${form}`);
   await wait(3);
   seen.written = [...new Set(written)];
+  // What cannot be written is no link and says why; of two refusals the last one is seen, and no page but theirs shows it.
+  await page.click("[data-impossible] summary");
+  seen.impossible = [await page.locator("[data-impossible]").innerText(), await page.locator("[data-impossible] a").count()];
+  broken = ["usd", "c3d"];
+  for (const form of broken) await page.click(`[data-downloads] a >> text=${form}`);
+  await page.locator("[role=alert] >> text=c3d: no disk").waitFor();
+  seen.alerts = [await page.locator("[role=alert]").count()];
+  await page.setViewportSize({ width: 390, height: 800 });
+  seen.covered = (await page.locator(".messages").boundingBox()).height;
+  await page.setViewportSize({ width: 1440, height: 900 });
+  await page.evaluate(() => (location.hash = "#/"));
+  await page.waitForSelector("[data-downloads]", { state: "detached" });
+  seen.alerts.push(await page.locator("[role=alert] >> text=no disk").count());
+  await page.goBack();
+  await page.waitForSelector("[data-person]");
   slow = 1;
   for (const [id, name] of [[7, "kane"], [8, "rice"]]) {
     await page.dblclick(`[data-person="${id}"]`);
@@ -111,7 +128,7 @@ async function showNewRun() {
   await page.click('[data-person="7"]');
   await page.click("button >> text=Join two", { timeout: 5000 });
   await page.click('[data-person="8"]');
-  await page.click("button >> text=Join two");
+  await page.click("button >> text=Join these two");
   await wait(2);
   seen.pair = merged;
 }
@@ -126,6 +143,10 @@ const held = async (key, count) => {
 
 // A question whose evidence comes at the second request, with a long curve, and whose video cannot be drawn; held keys.
 async function ask() {
+  await at_server("match/final", (path) => ({ "/api/session": session, "/api/matches/final": matchOf("0001", [question(1)]) })[path]);
+  await page.waitForSelector("article.open");
+  await wait(0.5);
+  seen.scrolled = [await page.evaluate(() => [scrollY, document.querySelector("main").scrollTop])];
   let reviews = [1, 2, 3, 4].map(question);
   let isThere = false;
   const [decided, removed] = [[], []];

@@ -13,7 +13,7 @@ from data_contracts.review import NamedTrack, SplitTrack
 from data_contracts.run import UnitFailure
 from flows import run_record
 from flows.layers import write_layer
-from flows.match_state import match_state
+from flows.match_state import NEEDS_FILES, _find, match_state
 from flows.method import METHOD
 from flows.overview import read_summary
 from flows.registering import open_match
@@ -73,6 +73,10 @@ def test_corrections_make_a_match_out_of_date_and_names_do_not(store):
 def test_questions_then_answers(store):
     run_match(store, open_match(store, TINY), RunRequest({}, gates="auto"))
     assert state(store).words == "2 questions"
+    match, latest = open_match(store, TINY), store.run(TINY)
+    lost = {**latest.figures, "tracking/clip": {"unmatched_share": 0.6}}
+    found = _find(store, match, latest.model_copy(update={"figures": lost}), {}, [], [])
+    assert (found.words, found.todo) == ("not usable, 2 questions", NEEDS_FILES)
     decide(store, open_match(store, TINY), (), "approve", who="Ada", why="")
     assert state(store).words == "out of date because its questions are answered"
 

@@ -5,6 +5,7 @@ import os
 import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from fractions import Fraction
 
 import av
@@ -13,12 +14,13 @@ import numpy as np
 import page_client
 import pytest
 
+from flows.layers import write_layer
 from flows.registering import register
 from flows.service.inbox import entries, fingerprint_of, missing_of, watch_once
 from flows.service.layout import served_state
 from flows.web.access import access_for
 from flows.web.app import create_app
-from flows.web.draft_folder import SPARE_BYTES
+from flows.web.draft_folder import SPARE_BYTES, _doubt_detector
 from flows.web.guard import CHUNK_BYTES
 from flows.web.intake import Intake
 from worldpose.ingest.match_folder import read_match
@@ -300,12 +302,21 @@ def test_files_of_other_tools_become_calibration_clicks_and_poses(place, footage
     view = ada.get(f"{DRAFTS}/{draft}").json()
     assert view["problems"] == []
     assert "scaled by 0.5" in " ".join(view["notes"])
+    assert view["files"][-1]["calibrates"] == ["near_left"]
     assert str(place) not in str(view["notes"]) and "--" not in str(view["notes"])
     ada.post(f"{DRAFTS}/{draft}/finish", json={})
     match = read_match(place / "inbox" / "final")
     assert match.calibrations["near_left"].focal_px == (100.0, 100.0)
     assert match.clicked["near_left"].points[0].xy == (39.5, 29.5)  # the image begins at a corner
     assert not (place / "inbox" / "final" / "given").exists()
+    # In a laboratory, people are taller than the bundled nets know.
+    store = Store.open(str(place / "project"))
+    lab = replace(match, spec=match.spec.model_copy(update={"pitch": "none"}))
+    (said,) = _doubt_detector(store, lab)
+    assert "28 to 160 px" in said and said.startswith("warning: no 2D poses are given")
+    assert _doubt_detector(store, match) == []
+    write_layer(store, "project", {"detection.detector": "onnx:/x.onnx"})
+    assert _doubt_detector(store, lab) == []
 
 
 def test_files_named_by_the_first_word_of_a_camera_are_its_own(place, footage):

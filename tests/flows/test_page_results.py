@@ -3,6 +3,7 @@
 import io
 import shutil
 import zipfile
+from importlib.util import find_spec
 
 import numpy as np
 import page_client
@@ -19,16 +20,18 @@ from flows.registering import open_match
 from flows.reports.cameras import camera_table
 from flows.results.best_results import fitted_bodies
 from flows.results.evaluation import score
+from flows.results.possible_exports import OF_BODIES, OF_BROADCAST, OF_EXTRAS, impossible_exports
 from flows.review.corrections import keep_edits
-from flows.web.results import BROADCAST_FORMATS
 from worldpose.formats.viewer_file import decode_bodies, decode_part, read_viewer
 from worldpose.store.store import Run, Store, open_run
 
 
 def test_a_complete_run_gives_its_report_and_its_exports(reader):
     found = reader.get(f"{MATCH}/results").json()
-    of_static_cameras = [form for form in EXPORT_FORMATS if form not in BROADCAST_FORMATS]
-    assert (found["run"], found["formats"]) == ("0001", of_static_cameras)
+    absent = {form for form, name in OF_EXTRAS.items() if find_spec(name) is None}
+    assert set(found["impossible"]) == {*OF_BROADCAST, *absent}
+    possible = [form for form in EXPORT_FORMATS if form not in found["impossible"]]
+    assert (found["run"], found["formats"]) == ("0001", possible)
     judged = reader.get(MATCH).json()["run"]["usability"]
     assert judged["verdict"] == "usable with reservations"
     assert [text.partition(" contradict")[0] for text in judged["reservations"]] == [
@@ -154,6 +157,15 @@ def test_an_open_page_gets_the_run_that_it_shows_until_it_shows_the_next(ada, pr
     add_run(project_copy, "complete", stages)  # without bodies
     assert all(new != old for new, old in zip(answers(""), before, strict=True))
     assert answers("run_id=0001") == before
+    store = Store.open(str(project_copy))
+    spec = store.registration(TINY).spec.model_copy(update={"pitch": "none"})
+    lacking = impossible_exports(open_run(store, TINY, "0002"), spec)
+    assert lacking["minimap"] == "The match has no pitch."
+    bodies = {lacking[form] for form in {*OF_BODIES} - {*OF_BROADCAST}}
+    assert bodies == {"The run has no fitted bodies yet."}
+    assert ada.get(f"{MATCH}/results").json()["formats"] == [
+        form for form in EXPORT_FORMATS if form not in lacking or form == "minimap"
+    ]
     assert "no such run" in ada.get(f"{MATCH}/results/metrics?run_id=0009").json()["error"]
     assert ada.get(f"{MATCH}/results/metrics?run_id=../x").status_code == 422
 
@@ -174,7 +186,8 @@ def test_results_say_which_change_made_them_old(ada, project_copy, tmp_path):
 
 def test_a_run_without_people_is_a_clear_message(ingested, tmp_path):
     ada = page_client.log_in(page_client.served(shutil.copytree(ingested, tmp_path / "data")), "A")
-    assert ada.get(f"{MATCH}/results").json()["clips"] == []
+    found = ada.get(f"{MATCH}/results").json()
+    assert (found["clips"], found["impossible"]["joints"]) == ([], "The run has no people yet.")
     for path in ("metrics", "report", "scenes/clip", "videos/clip", "exports/joints"):
         answer = ada.get(f"{MATCH}/results/{path}")
         assert answer.status_code == 422, path

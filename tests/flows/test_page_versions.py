@@ -5,6 +5,7 @@ import os
 import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import page_client
@@ -25,6 +26,7 @@ from test_page_drafts import (
     settle,
 )
 
+from data_contracts.operations import MatchSummary
 from data_contracts.review import NamedTrack
 from flows.match_state import match_state
 from flows.registering import open_for_review, open_match
@@ -32,6 +34,7 @@ from flows.review.corrections import keep_edits
 from flows.service.inbox import put_in, take_in, watch_once
 from flows.service.layout import StateFolder, served_state
 from flows.web.draft_folder import LINKED_BYTES, SPARE_BYTES
+from flows.web.queue import _intake
 from worldpose.errors import InputError
 from worldpose.store.store import Store
 
@@ -72,6 +75,18 @@ def final(place, footage):  # noqa: F811
     return ada, place / "inbox" / "final"
 
 
+def test_a_match_that_is_being_taken_in_waits_and_offers_no_run(place, final):  # noqa: F811
+    store = Store.open(str(place / "project"))
+    context = SimpleNamespace(store=store, registration=store.registration)
+    state = served_state(store.url)
+    summary = MatchSummary(match_id="final", kind="new", words="not run yet")
+    assert _intake(context, summary) is None
+    arrival = state.arrivals()["final"]
+    state.write_arrival(arrival.model_copy(update={"state": "arriving"}))
+    assert _intake(context, summary)["is_intake"]
+    assert _intake(context, summary.model_copy(update={"kind": "ready"})) is None
+
+
 def test_a_further_camera_makes_the_next_version_and_the_folder_before_stays(
     place,  # noqa: F811
     footage,  # noqa: F811
@@ -92,7 +107,7 @@ def test_a_further_camera_makes_the_next_version_and_the_folder_before_stays(
     camera = {"id": "far", "width": SIZE[0], "height": SIZE[1], "video": "videos/far.mp4"}
     view = save(ada, view, content | {"cameras": [*content["cameras"], camera]}).json()
     assert view["is_ready"], view["problems"]
-    assert any(note.startswith("The next run computes") for note in view["notes"]), view["notes"]
+    assert any(note.startswith("The next run begins") for note in view["notes"]), view["notes"]
     another = ada.post(DRAFTS, json={"match": "final"}).json()["id"]
     with monkeypatch.context() as full:  # of whom it is the next version is known nevertheless
         full.setattr(StateFolder, "write_arrival", Mock(side_effect=OSError(28, "full")))
@@ -144,8 +159,8 @@ def test_runs_and_names_outlast_the_next_version(project_copy, tiny):
     content["cameras"] = [each for each in content["cameras"] if each["id"] != camera]
     view = save(ada, view, content).json()
     assert view["is_ready"], view["problems"]
-    (said,) = (note for note in view["notes"] if note.startswith("The next run computes"))
-    assert "people" in said and "It keeps" in said
+    (said,) = (note for note in view["notes"] if note.startswith("The next run begins"))
+    assert "people" in said and ", and keeps " in said and len(said) < 160
     truth = f"reference/cameras/{camera}.npz"
     assert f"{truth} is left out: there is no such camera" in view["notes"]
     ada.post(f"{DRAFTS}/{draft}/finish", json={})

@@ -161,6 +161,9 @@ def test_pages_lose_and_repeat_nothing_at_a_slow_or_refusing_server(tmp_path):
     assert seen["split"] == ["To split kane, move to a frame after 100, and not after 299.", True]
     assert (seen["pair"], seen["given"]) == ([7, 8], True)
     assert seen["written"] == ["usd?run_id=0002", "c3d?run_id=0002"]
+    assert "minimap The match has no pitch." in seen["impossible"][0] and seen["impossible"][1] == 0
+    assert seen["alerts"] == [1, 0] and seen["covered"] < 800 / 4
+    assert seen["scrolled"] == [[0, 0]]
     # A held key counts once, but moves on.
     assert (seen["removed"], seen["row"], seen["decided"]) == ([1], "4", ["q1"])
     assert (seen["curves"], seen["tables"]) == (1, 1)

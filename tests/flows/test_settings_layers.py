@@ -323,7 +323,10 @@ def test_a_page_shows_and_saves_the_layers(store, ada, bob):
     assert read_layer(store, "project").values == {"tracking.gate_m": 0.45}
     sent["revision"] = saved["layers"][0]["revision"]
     wrong = ada.post(path, json={**sent, "values": {"tracking.gate_m": -1}})
-    assert wrong.status_code == 422 and "tracking.gate_m" in wrong.json()["error"]
+    assert wrong.json()["error"].startswith("settings of the project: tracking.gate_m")
+    mistyped = ada.post(path, json={**sent, "values": {"tracking.gate": 1}}).json()["error"]
+    assert "Did you mean 'tracking.gate_m'?" in mistyped and page_settings.ON_PAGE in mistyped
+    assert store.url not in mistyped and "operator" not in mistyped
     for layer in ("matches/none", "venues/../x", "elsewhere"):
         answer = ada.post(path, json={"layer": layer, "values": {}, "revision": ""})
         assert answer.status_code == 404

@@ -258,11 +258,11 @@ def test_a_page_starts_a_match_by_its_deployment_and_says_what_it_waits_for(
     assert len(open_of(prefect, "clicked")) == 2
     assert continuing.running() == {"clicked": False, "clicked-too": True}
     assert continuing.cancel("clicked", "Ada") and continuing.cancel("clicked-too", "Ada")
-    (run,) = open_of(prefect, "clicked")  # the one at work: its worker ends it
-    prefect.queue.change(run, "failed", "too dark")
+    assert open_of(prefect, "clicked") == [] and not continuing.cancel("clicked", "Ada")
+    assert prefect.queue.change(prefect.queue.latest(run), "complete") is None
+    assert continuing.state("clicked")["lines"][0].endswith("page of the match by Ada.")
+    prefect.queue.change(prefect.start("clicked"), "failed", "too dark")
     assert continuing.state("clicked")["lines"] == ["too dark"]
-    prefect.queue.change(prefect.queue.latest(run), "cancelled", "cancelled by Ada")
-    assert continuing.state("clicked")["lines"] == ["Cancelled by Ada."]
 
 
 def test_the_worker_takes_installed_runs_with_parameters_of_their_own_alone(plan):

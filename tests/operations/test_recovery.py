@@ -8,19 +8,24 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext, suppress
 from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
+from uuid import UUID
 
 import psutil
 import pytest
+from prefect.client.schemas.objects import FlowRun
+from prefect.states import Pending
 from service import wait_until
 
 from data_contracts.operations import Heartbeat, QueuedRun
 from flows.orchestration import suspension
 from flows.progress import Reporter, reporting_to
-from flows.service import recovery, run_queue, watching
+from flows.service import recovery, run_process, run_queue, watching
 from flows.service.alerts import AlertDispatcher, kept_alerts
 from flows.service.health import _check_progress
+from flows.service.match_runs import MatchRuns
 from flows.service.plan import ServePlan
 from flows.service.recovery import Liveness
 from flows.service.run_queue import beating, find_process
@@ -57,6 +62,42 @@ def test_of_two_writers_of_a_state_one_wins_and_all_states_stay(queue, tmp_path)
     files = sorted(path.name for path in (tmp_path / "queue" / "match" / "m").iterdir())
     assert files == ["id-m.0001.json", "id-m.0002.json"]
     assert verify(Store.open(str(tmp_path))) == ()
+
+
+@pytest.mark.parametrize("step", ["before", "read", "take", "begin", "run"])
+def test_a_run_that_was_cancelled_stays_so_whatever_its_process_does(queue, monkeypatch, step):
+    run, runs = queue.take(a_run()), MatchRuns("", project=queue.blobs.url)
+    asked = {"id": UUID(int=1), "flow_id": UUID(int=2), "parameters": {"project": runs.project}}
+    there, done, told = FlowRun(**asked, state=Pending()), [], []
+    monkeypatch.setattr(MatchRuns, "find", lambda *given: {})
+    monkeypatch.setattr(MatchRuns, "set_state", lambda runs, *state: told.append(state))
+
+    def at(name, answer=None):
+        done.append(name)
+        if name == step and not told:
+            assert runs.cancel(run, "by Ada") and not runs.cancel(run, "by Ben")
+        return answer
+
+    client = SimpleNamespace(
+        read_flow_run=lambda run_id: at("read", there), read_flow_run_states=lambda run_id: [there]
+    )
+    took, begun = RunQueue.take, RunQueue.begin
+    monkeypatch.setattr(RunQueue, "take", lambda *given: at("take", took(*given)))
+    monkeypatch.setattr(RunQueue, "begin", lambda *given: at("begin", begun(*given)))
+    monkeypatch.setattr(run_process, "get_client", lambda **given: nullcontext(client))
+    monkeypatch.setattr(run_process, "queued_run", lambda *given: a_run())
+    monkeypatch.setattr(run_process, "run_flow", lambda *given, **more: at("run"))
+    at("before")
+    with suppress(SystemExit):
+        run_process.main("match", UUID(int=1))
+    last = queue.latest(run)
+    assert (last.state, last.message, queue.open_runs()) == ("cancelled", "by Ada", [])
+    assert told == [(last.flow_run, "CANCELLED", "by Ada")]
+    assert ("run" in done) is (step in ("begin", "run"))
+    again = SimpleNamespace(is_scheduled=lambda: True, timestamp=datetime.now(UTC))
+    client.read_flow_run_states = lambda run_id: [again]  # a person retries it at Prefect
+    run_process.main("match", UUID(int=1))
+    assert queue.latest(run).state == "complete"
 
 
 def test_a_damaged_state_is_found_and_hides_no_other_run(queue, tmp_path, caplog):

@@ -82,7 +82,12 @@ class RunQueue:
         message: str = "",
         **more: Any,  # noqa: ANN401
     ) -> QueuedRun | None:
-        """Record the next state of a run; None if another process has recorded one meanwhile."""
+        """Record the next state of a run; None if another process has recorded one meanwhile.
+
+        A run that has ended can only be asked for again.
+        """
+        if run.state in ENDED and state != "asked":
+            return None
         update = {"number": run.number + 1, "state": state, "message": message, **more}
         after = run.model_copy(update={**update, "changed_at": datetime.now(UTC)})
         if not self.add(after):
@@ -91,14 +96,27 @@ class RunQueue:
             self.blobs.delete(_beat_path(run))
         return after
 
-    def begin(self, run: QueuedRun, flow_run: str) -> QueuedRun:
-        """Record that this process computes a run from now on."""
+    def begin(self, run: QueuedRun, flow_run: str) -> QueuedRun | None:
+        """Record that this process computes a run from now on; None if the run has ended."""
         process = {"host": platform.node(), "pid": os.getpid(), "worker_pid": os.getppid()}
-        while True:
-            run = self.latest(run)
-            begun = self.change(run, "begun", run.message, flow_run=flow_run, **process)
-            if begun is not None:
-                return begun
+        return self._insist(run, "begun", flow_run=flow_run, **process)
+
+    def cancel(self, run: QueuedRun, why: str) -> QueuedRun | None:
+        """Record that a run is cancelled, whatever it does now; None if it has ended."""
+        return self._insist(run, "cancelled", why)
+
+    def _insist(
+        self,
+        run: QueuedRun,
+        state: QueueState,
+        why: str = "",
+        **more: Any,  # noqa: ANN401
+    ) -> QueuedRun | None:
+        """Record a state, after those of other processes, of a run that has not ended."""
+        after = None
+        while after is None and (run := self.latest(run)).state not in ENDED:
+            after = self.change(run, state, why or run.message, **more)
+        return after
 
     def kill(
         self, run: QueuedRun, why: str, *, by_service: bool = False, stalled: str = ""

@@ -1,15 +1,13 @@
-// What the server refused: it stays on every page until a person dismisses it.
+// What the server refused: the newest takes the place of the one before, until a person dismisses it or leaves the page.
 class Messages {
-  list = $state([]);
-  #last = 0;
+  text = $state("");
 
   tell(text) {
-    if (this.list.some((each) => each.text === text)) return;
-    this.list.push({ id: ++this.#last, text });
+    this.text = text;
   }
 
-  dismiss(id) {
-    this.list = this.list.filter((each) => each.id !== id);
+  clear() {
+    this.text = "";
   }
 }
 
