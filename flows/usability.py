@@ -101,6 +101,14 @@ triangulation unhealthy_s max_unhealthy_s
 the keypoints of {part} depart from the people in {unit}, or its images are bad, for {value} at a
 time{when}. Look at the video there.
 
+triangulation unhealthy_share max_absent_share
+the keypoints of {part} depart from the people in {unit}, or its images are bad, for {value} of the
+time{when}. Look at the video there.
+
+triangulation missed_share max_unusable_share
+detections of {part} lack a person of {unit} whom its images should show, for {value} of the
+time{when}. Look at the people of that camera, or give better 2D poses.
+
 triangulation misplacement_m max_misplacement_m
 the calibration of {part} displaces people in {unit} by {value}. Click more markings, where there
 are none.
@@ -187,7 +195,7 @@ def judge_run(outcome: RunOutcome, limits: UsableLimits) -> Usability:
 def exceeded_limits(figures: Mapping[str, Figures], limits: UsableLimits) -> list[str]:
     """Return a sentence for each metric beyond its limit; metrics are given by unit and name."""
     found: list[str] = []
-    figures = {name: _as_normal(own, figures) for name, own in figures.items()}
+    figures = {name: _as_normal(own, figures, limits) for name, own in figures.items()}
     # Joints measure what errors of the cameras do to people.
     has_joints = any(own.get("joints") for own in figures.values())
     for rule in _RULES:
@@ -202,8 +210,10 @@ def exceeded_limits(figures: Mapping[str, Figures], limits: UsableLimits) -> lis
     return found
 
 
-def _as_normal(own: Figures, figures: Mapping[str, Figures]) -> Figures:
+def _as_normal(own: Figures, figures: Mapping[str, Figures], limits: UsableLimits) -> Figures:
     """Return a unit's metrics with motions of cameras in deviations of a normal error.
+
+    Of a camera that is not healthy for too long, the share is not said, too.
 
     Calibration estimates the noise of a camera's clicks from these: the error over the stated
     deviation has Student's distribution. With n degrees of freedom, t deviations are as improbable
@@ -219,6 +229,8 @@ def _as_normal(own: Figures, figures: Mapping[str, Figures]) -> Figures:
             if n > 0.0:
                 share = (8.0 * n + 1.0) / (8.0 * n + 3.0)
                 normal[name] = share * sqrt(n * log1p(moved**2 / n))
+        if metric == "unhealthy_s" and exceeds(moved, limits.max_unhealthy_s):
+            normal.pop(f"unhealthy_share.{camera}", None)
     return normal
 
 
@@ -230,7 +242,7 @@ def _exceeding(rule: _Rule, place: str, figures: Figures, limit: float) -> Itera
     own = {
         name.partition(".")[2]: value
         for name, value in figures.items()
-        if name.partition(".")[0] == rule.metric
+        if name.partition(".")[0] == rule.metric and ("." in name or "{part}" not in rule.says)
     }
     nobody = 0.0 in (figures.get("joints"), figures.get("bodies"))
     unknown = [part for part, value in own.items() if not isfinite(value)]
@@ -259,9 +271,9 @@ def _when(subject: str, part: str, figures: Figures) -> str:
     """Return the longest time of what a metric counts, and of which person; empty if unknown."""
     ending = f".{part}" if part else ""
     first, last = (figures.get(f"{subject}_{end}_frame{ending}") for end in ("from", "to"))
+    person = figures.get(f"{subject}_person{ending}")
     if first is None or last is None:
-        return ""
-    person = figures.get(f"{subject}_person")
+        return "" if person is None else f", longest person {person:.0f}"
     whose = "" if person is None else f"person {person:.0f} "
     frames = f"frame {first:.0f}" if first == last else f"frames {first:.0f} to {last:.0f}"
     return f", longest {whose}in {frames}"

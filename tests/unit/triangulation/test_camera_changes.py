@@ -100,6 +100,19 @@ def test_a_camera_departs_no_farther_than_its_calibration_states(cameras):
     assert (bad == 0.0).all()
 
 
+def test_health_counts_the_people_whom_a_camera_shows_and_has_not_found(cameras):
+    people = view(cameras, lambda pixels, *_: pixels)
+    joints = triangulate_views(Rig.from_cameras(cameras), people, SETTINGS)
+    people.detection_index[:180, BAD, 1] = -1
+    health = CameraHealth.empty(FRAMES, 4, people.detection_index.shape[2], FPS)
+    health.add(cameras, people, joints, 0)
+    joints[:, 1] += [0.0, 0.0, 500.0]  # out of the images
+    health.add(cameras, people, joints, 0)
+    expected = np.zeros_like(health.missed)
+    expected[BAD, 1] = 179 / health.every
+    assert health.missed == pytest.approx(expected, abs=1.0)
+
+
 def test_health_tells_images_that_are_missing_dark_or_blurred(cameras):
     people = view(cameras, lambda pixels, *_: pixels)
     frame = np.arange(FRAMES)[:, None] * np.ones(4)
