@@ -163,13 +163,29 @@ def test_failed_units_and_cameras_left_out_are_reservations():
         ({"lacks_people": True}, "no person is placed."),
         ({"waiting": 2}, "results that wait for review: 2."),
         ({"unit": "tracking/clip", "figures": {"absent_share": 0.6}}, "people are missing in"),
-        ({"unit": "tracking/clip", "figures": {"unmatched_share": 0.63}}, "no track follows more"),
+        ({"unit": "tracking/clip", "figures": {"unmatched_share": 0.63}}, "no track follows 63 %"),
     ],
 )
 def test_results_that_are_not_there_are_not_usable(outcome, said):
     found = judge(**{"unit": "x/y", **outcome})
     assert found.verdict == "not usable"
-    assert found.reservations[0].startswith(said)
+    (text,) = found.reservations  # the same number is not said with two limits
+    assert text.startswith(said)
+
+
+def test_the_cause_is_said_before_what_it_does_and_advice_fits_given_cameras():
+    figures = {"tracking/clip": {"unmatched_share": 0.63}, "static_calibration/cam1": {}}
+    figures["retriangulation/clip"] = HEALTHY["retriangulation/clip"] | MISPLACED
+    warnings = {"detection/cam1.clip": ["cam1.clip: people are 833 px tall."]}
+    cause, effect, misplaced = judge_run(
+        RunOutcome(figures=HEALTHY | figures, warnings=warnings), UsableLimits()
+    ).reservations
+    assert cause == "cam1.clip: people are 833 px tall."
+    assert effect.startswith("no track follows 63 % (limit 50 %)")
+    assert misplaced.endswith("Calibrate it anew.")
+    clicked = figures | {"static_calibration/cam1": {"clicks_wrong": 0.0}}
+    found = judge_run(RunOutcome(figures=HEALTHY | clicked), UsableLimits()).reservations
+    assert found[-1].endswith("Click more markings, where there are none.")
 
 
 def test_people_who_are_not_in_3d_are_places_that_can_be_used():
