@@ -22,7 +22,7 @@ from worldpose.triangulation.camera_changes import (
     refine_change,
     sum_clip,
 )
-from worldpose.triangulation.change_parts import Part, fit_parts
+from worldpose.triangulation.change_parts import Part, find_sway, fit_parts
 from worldpose.triangulation.change_sums import ChangeSums
 from worldpose.triangulation.clock_courses import (
     add_slow_drifts,
@@ -259,6 +259,17 @@ def test_a_camera_that_meets_its_only_person_no_more_is_told(cameras, spoil, lon
     confidence = confidence * np.isfinite(pixels[..., 0])
     seen = KeypointDetections.from_keypoints(pixels, confidence, index, frame)
     assert find_lone_views(cameras, seen, joints, FPS) == lone
+
+
+@pytest.mark.parametrize(("seconds", "found"), [(2, None), (4, BAD)])
+def test_one_difference_between_two_seconds_is_no_sway(cameras, seconds, found):
+    def jump(pixels, frame, _):
+        return pixels + 60.0 * (frame // round(FPS) % 2)[..., None] * np.array([1.0, 0.5])
+
+    people = view(cameras, jump)[: seconds * round(FPS)]
+    sums = sum_clip(cameras, people, FPS, np.arange(seconds * round(FPS)), settings=SETTINGS)
+    swaying = find_sway(sums, sums, [])
+    assert (None if swaying is None else swaying[0]) == found
 
 
 def test_a_camera_that_sways_is_not_explained(cameras):
