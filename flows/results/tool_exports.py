@@ -66,6 +66,7 @@ def describe_clip(origin: best_results.Origin, clip: str) -> dict[str, str]:
     """Return what the files of a clip say about themselves, by a short name."""
     stages = [stage for stage in reversed(JOINT_STAGES) if f"{stage}/{clip}" in origin.run]
     stage = origin.stage or (stages[0] if stages else best_results.PLANE)
+    said = origin.run.record.usability
     notes = {
         "software": f"worldpose {version('worldpose')}",
         "match": origin.spec.match_id,
@@ -80,6 +81,7 @@ def describe_clip(origin: best_results.Origin, clip: str) -> dict[str, str]:
         "filled": "gaps interpolated on request; joints without a contributing camera are flagged"
         if origin.filled
         else "joints without a contributing camera come from the motion or the rest of the body",
+        "verdict": "; ".join((said.verdict, *said.reservations)),
         "licence": origin.licence or "not stated: ask the owner of the recording",
     }
     if changes := view_changes(origin.run, clip, origin.stage):

@@ -290,6 +290,7 @@ def test_files_for_tools_say_what_they_hold(match_folder, tmp_path, monkeypatch)
     ]
     for text in texts:
         assert b"For tests alone." in text
+        assert b"usable" in text
         assert b"open-neutral/2 (CC0 1.0)" in text
     assert b"mixed" in texts[0] and b"mixed" in texts[2] and b'"kind":"mixed"' in texts[3]
     assert b"COCO-17 keypoints of the fitted body open-neutral/2" in texts[1]
