@@ -298,7 +298,7 @@ def _when(subject: str, part: str, figures: Figures) -> str:
     first, last = (figures.get(f"{subject}_{end}_frame{ending}") for end in ("from", "to"))
     person = figures.get(f"{subject}_person{ending}")
     if first is None or last is None:
-        return "" if person is None else f", longest person {person:.0f}"
+        return "" if person is None else f", person {person:.0f} in {part}"
     whose = "" if person is None else f"person {person:.0f} "
     frames = f"frame {first:.0f}" if first == last else f"frames {first:.0f} to {last:.0f}"
     return f", longest {whose}in {frames}"

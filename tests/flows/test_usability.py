@@ -54,7 +54,11 @@ def test_a_healthy_run_is_usable_and_adjusted_cameras_replace_those_before():
         ("retriangulation/clip", {"standard_deviation_m": 0.2}, "joints in clip are uncertain"),
         ("retriangulation/clip", UNHEALTHY, r"cam3, cam2 depart .* 3 s \(limit 2 s\) .* 0 to 74"),
         ("retriangulation/clip", HALF, r"cam3 depart .* 55\.6 % \(limit 5 %\) .* 48 to 99\."),
-        ("retriangulation/clip", MISSED, r"of cam1 lack .* 73 % \(limit 50 %\) .* person 1\."),
+        (
+            "retriangulation/clip",
+            MISSED,
+            r"of cam1 lack .* 73 % \(limit 50 %\) .* person 1 in cam1\.",
+        ),
         ("retriangulation/clip", MISPLACED, r"cam4 displaces people in clip by 8 cm \(limit 5"),
         ("retriangulation/clip", {"filled_share": 0.1}, r"no camera sees 10 % \(limit 5 %\)"),
         ("bundle_adjustment/cameras", MOVED, "contradict the calibration of cam4: .* by 7.1"),
