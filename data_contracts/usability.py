@@ -16,11 +16,12 @@ class UsableLimits(Record):
     """Share of a video's frames of a clip without a readable image [1]: a recorder loses single
     frames, not one second of a hundred."""
     max_absent_share: Share = 0.05
-    """Share of the time in which tracked people, or all people, are missing for a second or more
-    [1]: shorter absences are occlusions."""
+    """Share of the time in which tracked people, or all people, are missing for a second or more,
+    or a camera departs from the people as of `max_unhealthy_s` [1]: shorter absences are
+    occlusions."""
     max_unhealthy_s: Amount = 2.0
     """Longest time in which a camera departs from the people, or its images are dark, bright,
-    blurred or missing [s]. One bad second is in the joints of other cameras."""
+    blurred or missing [s]. One bad second of a long clip is in the joints of other cameras."""
     max_unmatched_share: Share = 0.15
     """Share of detections without a track [1]: staff and crowd cause some, a camera with a wrong
     clock or pose causes many."""
@@ -59,7 +60,8 @@ class UsableLimits(Record):
     median over people and frames [m]: twice that of a good camera in simulation, 0.47 m."""
     max_unusable_share: Share = 0.5
     """Share of the time without people, or of detections without a track, beyond which results are
-    not usable [1]: most of the clip has none."""
+    not usable [1]: most of the clip has none. Also that of the time in which a camera lacks a
+    person whom it should show."""
 
 
 class Usability(Record):

@@ -182,7 +182,7 @@ GATES: Final[Mapping[str, Gate]] = {
                 "standard_deviation_m": _USABLE.max_standard_deviation_m,
                 "filled_share": _USABLE.max_filled_share,
                 # Share of the clip in which the worst camera departs from people or shows little.
-                "unhealthy_share": 0.05,
+                "unhealthy_share": _USABLE.max_absent_share,
             },
             "the keypoints in the images, or the cameras",
             _in_3d,

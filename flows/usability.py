@@ -39,6 +39,15 @@ _REPLACED: Final = {"triangulation": "retriangulation"}
 """Stage to a later one whose metrics replace its own."""
 
 
+_UNUSABLE: Final = {
+    "absent_share": "people are missing in {} for {} of the time. Check the videos, or the "
+    "given 2D poses.",
+    "unmatched_share": "no track follows {1} of the people found in the images of {0}. The "
+    "calibration or the clock of a camera is wrong, or the detector was made for other images.",
+}
+"""Metric of tracking to what is said where its share makes results not usable."""
+
+
 @dataclass(frozen=True)
 class _Rule:
     """Metric with a limit; larger is worse.
@@ -82,8 +91,8 @@ people are missing in {unit} for {value} of the time{when}. Look at the videos,
 or the given 2D poses, there.
 
 tracking unmatched_share max_unmatched_share required
-no track follows {value} of the people found in the images of {unit}. Look for people beside the
-pitch, or for a camera whose clock or calibration is wrong.
+no track follows {value} of the people found in the images of {unit}. Look for people who take no
+part, or for a camera whose clock or calibration is wrong.
 
 tracking mean_ray_distance_m max_ray_distance_m
 cameras disagree by {value} about where people are in {unit}. Check the calibration and the clocks
@@ -100,6 +109,14 @@ their 2D poses.
 triangulation unhealthy_s max_unhealthy_s
 the keypoints of {part} depart from the people in {unit}, or its images are bad, for {value} at a
 time{when}. Look at the video there.
+
+triangulation unhealthy_share max_absent_share
+the keypoints of {part} depart from the people in {unit}, or its images are bad, for {value} of the
+time{when}. Look at the video there.
+
+triangulation missed_share max_unusable_share
+detections of {part} lack a person of {unit} whom its images should show, for {value} of the
+time{when}. Look at the people of that camera, or give better 2D poses.
 
 triangulation misplacement_m max_misplacement_m
 the calibration of {part} displaces people in {unit} by {value}. Click more markings, where there
@@ -165,29 +182,42 @@ def usable_limits(match: Match) -> UsableLimits:
 
 def judge_run(outcome: RunOutcome, limits: UsableLimits) -> Usability:
     """Return the verdict on a run's results."""
-    against = list(_reasons_against(outcome, limits))
+    against, shares = list(_reasons_against(outcome)), list(_unusable_shares(outcome, limits))
+    doubts = {
+        name: [each for each in texts if not each.endswith("the camera does not film this clip.")]
+        for name, texts in outcome.warnings.items()
+        if name.partition("/")[0] in DOUBTING
+    }
+    causes = [
+        text for name, texts in doubts.items() if name.startswith("detection/") for text in texts
+    ]
+    rest = {  # a share that makes results not usable is said once
+        name: {**own, **dict.fromkeys(_unusable(name, own, limits), 0.0)}
+        for name, own in outcome.figures.items()
+    }
     said = [
         *against,
+        *causes,
+        *shares,
         *(f"{each.unit} failed: {' '.join(each.message.split())}" for each in outcome.failed),
         *outcome.left_out,
-        *(() if against else _describe_lack(outcome)),
-        *exceeded_limits(outcome.figures, limits),
-        *(
-            text
-            for name, warnings in outcome.warnings.items()
-            if name.partition("/")[0] in DOUBTING
-            for text in warnings
-            if not text.endswith("the camera does not film this clip.")
-        ),
+        *(() if against or shares else _describe_lack(outcome)),
+        *exceeded_limits(rest, limits),
+        *(text for texts in doubts.values() for text in texts),
     ]
-    verdict = "not usable" if against else "usable with reservations" if said else "usable"
+    verdict = (
+        "not usable" if against or shares else "usable with reservations" if said else "usable"
+    )
     return Usability(verdict=verdict, reservations=tuple(dict.fromkeys(said)), limits=limits)
 
 
 def exceeded_limits(figures: Mapping[str, Figures], limits: UsableLimits) -> list[str]:
     """Return a sentence for each metric beyond its limit; metrics are given by unit and name."""
     found: list[str] = []
-    figures = {name: _as_normal(own, figures) for name, own in figures.items()}
+    was_clicked = any(
+        own for name, own in figures.items() if name.startswith("static_calibration/")
+    )
+    figures = {name: _as_normal(own, figures, limits) for name, own in figures.items()}
     # Joints measure what errors of the cameras do to people.
     has_joints = any(own.get("joints") for own in figures.values())
     for rule in _RULES:
@@ -199,11 +229,16 @@ def exceeded_limits(figures: Mapping[str, Figures], limits: UsableLimits) -> lis
             if stage == last or (stage == rule.stage and f"{last}/{unit}" not in figures):
                 limit = getattr(limits, rule.limit) if rule.limit else 0.0
                 found += _exceeding(rule, " in ".join(unit.split(".")), own, limit)
+    if not was_clicked:
+        clicks = "Click more markings, where there are none."
+        found = [text.replace(clicks, "Calibrate it anew.") for text in found]
     return found
 
 
-def _as_normal(own: Figures, figures: Mapping[str, Figures]) -> Figures:
+def _as_normal(own: Figures, figures: Mapping[str, Figures], limits: UsableLimits) -> Figures:
     """Return a unit's metrics with motions of cameras in deviations of a normal error.
+
+    Of a camera that is not healthy for too long, the share is not said, too.
 
     Calibration estimates the noise of a camera's clicks from these: the error over the stated
     deviation has Student's distribution. With n degrees of freedom, t deviations are as improbable
@@ -219,6 +254,8 @@ def _as_normal(own: Figures, figures: Mapping[str, Figures]) -> Figures:
             if n > 0.0:
                 share = (8.0 * n + 1.0) / (8.0 * n + 3.0)
                 normal[name] = share * sqrt(n * log1p(moved**2 / n))
+        if metric == "unhealthy_s" and exceeds(moved, limits.max_unhealthy_s):
+            normal.pop(f"unhealthy_share.{camera}", None)
     return normal
 
 
@@ -230,7 +267,7 @@ def _exceeding(rule: _Rule, place: str, figures: Figures, limit: float) -> Itera
     own = {
         name.partition(".")[2]: value
         for name, value in figures.items()
-        if name.partition(".")[0] == rule.metric
+        if name.partition(".")[0] == rule.metric and ("." in name or "{part}" not in rule.says)
     }
     nobody = 0.0 in (figures.get("joints"), figures.get("bodies"))
     unknown = [part for part, value in own.items() if not isfinite(value)]
@@ -259,9 +296,9 @@ def _when(subject: str, part: str, figures: Figures) -> str:
     """Return the longest time of what a metric counts, and of which person; empty if unknown."""
     ending = f".{part}" if part else ""
     first, last = (figures.get(f"{subject}_{end}_frame{ending}") for end in ("from", "to"))
+    person = figures.get(f"{subject}_person{ending}")
     if first is None or last is None:
-        return ""
-    person = figures.get(f"{subject}_person")
+        return "" if person is None else f", person {person:.0f} in {part}"
     whose = "" if person is None else f"person {person:.0f} "
     frames = f"frame {first:.0f}" if first == last else f"frames {first:.0f} to {last:.0f}"
     return f", longest {whose}in {frames}"
@@ -279,8 +316,8 @@ def _describe_lack(outcome: RunOutcome) -> Iterator[str]:
         )
 
 
-def _reasons_against(outcome: RunOutcome, limits: UsableLimits) -> Iterator[str]:
-    """Yield why results cannot be used at all."""
+def _reasons_against(outcome: RunOutcome) -> Iterator[str]:
+    """Yield why there is nothing to use."""
     if outcome.lacks_results:
         yield "the run failed. Correct what the failed units say, and run again."
     if outcome.lacks_people:
@@ -290,18 +327,19 @@ def _reasons_against(outcome: RunOutcome, limits: UsableLimits) -> Iterator[str]
             f"results that wait for review: {outcome.waiting}. Decide or correct them, "
             "and run again."
         )
-    most = limits.max_unusable_share
+
+
+def _unusable_shares(outcome: RunOutcome, limits: UsableLimits) -> Iterator[str]:
+    """Yield the parts of a clip without people that are too large to use the rest."""
     for name, own in outcome.figures.items():
-        stage, _, unit = name.partition("/")
-        if stage == "tracking" and own.get("absent_share", 0.0) > most:
-            share = f"{quantity('absent_share', most)} of the time"
-            yield (
-                f"people are missing in {unit} for more than {share}. Check the videos, or the "
-                "given 2D poses."
-            )
-        if stage == "tracking" and own.get("unmatched_share", 0.0) > most:
-            yield (
-                f"no track follows more than {quantity('unmatched_share', most)} of the people "
-                f"found in the images of {unit}. The calibration or the clock of a camera is "
-                "wrong, or the detector was made for other images."
-            )
+        for metric in _unusable(name, own, limits):
+            value = quantity(metric, own[metric])
+            limit = quantity(metric, limits.max_unusable_share)
+            place = name.partition("/")[2]
+            yield _UNUSABLE[metric].format(place, f"{value} (limit {limit})")
+
+
+def _unusable(name: str, own: Figures, limits: UsableLimits) -> list[str]:
+    """Return the metrics of a unit that make results not usable."""
+    beyond = [each for each in _UNUSABLE if own.get(each, 0.0) > limits.max_unusable_share]
+    return beyond if name.startswith("tracking/") else []

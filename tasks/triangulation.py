@@ -184,6 +184,13 @@ def _health_arrays(
         f"{UNHEALTHY}.{name}": share for name, share in zip(clip.camera_ids, shares, strict=True)
     }
     result.figures |= {UNHEALTHY: max(shares, default=0.0), **each}
+    missed = health.missed * health.every / max(1, len(rows))
+    for name, persons in zip(clip.camera_ids, missed if missed.size else (), strict=False):
+        worst = int(persons.argmax())
+        result.figures |= {
+            f"missed_share.{name}": float(persons[worst]),
+            f"missed_person.{name}": float(clip.person[worst]),
+        }
     ends = np.append(begun, frame[-1] + 1)[1:] - 1
     for camera, name in enumerate(clip.camera_ids):
         times = stretches(np.flatnonzero(bad[:, camera]))

@@ -62,12 +62,12 @@ def adjustment_tables(run: Run) -> list[Table]:
         marking, people = result["marking_error"].values[c], result["held_out_error"].values[c]
         judges = str(int(result["judges"].values[c]))
         said = (str(result.attrs[each][c]) for each in ("reasons", "weak"))
-        rows.append((name, *map(_number, (*marking, *people)), judges, *said))
+        rows.append((name, *said, *map(_number, (*marking, *people)), judges))
     cameras = Table(
         "Clicked markings and held-out people, before and after the adjustment",
         (
-            *("camera", ">markings before px", ">after px", ">people before px", ">after px"),
-            *(">held-out keypoints", "change", "least certain direction"),
+            *("camera", "change", "least certain direction", ">markings before px", ">after px"),
+            *(">people before px", ">after px", ">held-out keypoints"),
         ),
         tuple(rows),
     )
@@ -139,7 +139,7 @@ def body_tables(run: Run, clips: tuple[str, ...]) -> list[Table]:
         tables += _held_out_tables(clip, run.record.figures.get(f"body_fitting/{clip}", {}))
         without = run[unit].attrs.get("without_body") or {}
         if without:
-            heading = f"{clip_title(clip)}: people with a place on the pitch and no body"
+            heading = f"{clip_title(clip)}: people with a place on the ground and no body"
             tables.append(Table(heading, (">person", "reason"), tuple(without.items())))
     return tables
 

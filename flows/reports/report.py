@@ -192,7 +192,7 @@ def _sections(store: Store, run: Run, match: Match, truth: JointTracks | None) -
         Section(
             "People",
             tuple(people_tables(run, clips, match.folder.spec.fps)),
-            "Triangulated: joints and body in 3D. Plane: placed on the pitch by the feet, where "
+            "Triangulated: joints and body in 3D. Plane: placed on the ground by the feet, where "
             "too few cameras see the person; a body of such a person comes from the poses of a "
             "monocular method. Mixed: both, in different frames.",
         ),

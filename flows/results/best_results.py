@@ -285,6 +285,15 @@ def person_kinds(run: Run, clip: str) -> dict[int, str]:
     return {person: track.kind for person, track in tracked_people(run, clip)[1].items()}
 
 
+def describe_people(run: Run, clip: str) -> dict[int, dict[str, str]]:
+    """Return kind, and name if known, of every person of a clip, by id."""
+    people = tracked_people(run, clip)[1].items()
+    return {
+        person: {"kind": track.kind, **({"name": track.name} if track.name else {})}
+        for person, track in people
+    }
+
+
 def clip_positions(run: Run, clip: str) -> Positions:
     """Return the people of one clip on the pitch: the mid-hip of their joints, or their feet.
 

@@ -66,6 +66,7 @@ def describe_clip(origin: best_results.Origin, clip: str) -> dict[str, str]:
     """Return what the files of a clip say about themselves, by a short name."""
     stages = [stage for stage in reversed(JOINT_STAGES) if f"{stage}/{clip}" in origin.run]
     stage = origin.stage or (stages[0] if stages else best_results.PLANE)
+    said = origin.run.record.usability
     notes = {
         "software": f"worldpose {version('worldpose')}",
         "match": origin.spec.match_id,
@@ -81,6 +82,7 @@ def describe_clip(origin: best_results.Origin, clip: str) -> dict[str, str]:
         "filled": "gaps interpolated on request; joints without a contributing camera are flagged"
         if origin.filled
         else "joints without a contributing camera come from the motion or the rest of the body",
+        "verdict": "; ".join((said.verdict, *said.reservations)),
         "licence": origin.licence or "not stated: ask the owner of the recording",
     }
     if changes := view_changes(origin.run, clip, origin.stage):
@@ -321,11 +323,11 @@ def export_markers(origin: best_results.Origin, out: Path) -> Iterator[Path]:
 def export_c3d(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     """Write `markers/<clip>/person_<id>.c3d` for every person with a joint."""
     for clip in origin.clips:
-        tracks, kinds = origin.tracks(clip), best_results.person_kinds(origin.run, clip)
+        tracks, people = origin.tracks(clip), best_results.describe_people(origin.run, clip)
         notes = describe_clip(origin, clip)
         for person, person_id in _people_with_joints(tracks):
             path = out / "markers" / clip / f"person_{person_id:03d}.c3d"
-            about = {"kind": kinds[person_id], "first_match_frame": f"{tracks.frames[0]}"}
+            about = {**people[person_id], "first_match_frame": f"{tracks.frames[0]}"}
             write_c3d(path, tracks, person, origin.spec.fps, notes | about)
             yield path
 
@@ -351,7 +353,7 @@ def export_opensim(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     """Write `opensim/<clip>/person_<id>_frame_<first>.mot` for every uninterrupted interval."""
     for clip in origin.clips:
         model, poses, persons, frames = best_results.fitted_bodies(origin.run, clip)
-        kinds = best_results.person_kinds(origin.run, clip)
+        people = best_results.describe_people(origin.run, clip)
         notes = describe_clip(origin, clip) | {
             "world": "x as in the world of the match, y up, z = minus its y",
             "joints": motion_capture.OPENSIM_CONVENTION,
@@ -363,7 +365,7 @@ def export_opensim(origin: best_results.Origin, out: Path) -> Iterator[Path]:
                 path,
                 motion_capture.opensim_coordinates(model, poses[person, part]),
                 frames[part] / origin.spec.fps,
-                notes | {"kind": kinds[int(persons[person])]},
+                notes | people[int(persons[person])],
             )
             yield path
 
@@ -398,12 +400,12 @@ def export_scenes(
         cameras = origin.static_cameras | moving_cameras(
             origin.run, clip, frames, origin.static_cameras
         )
-        kinds = best_results.person_kinds(origin.run, clip)
+        known = best_results.describe_people(origin.run, clip)
         people = [
             AnimatedBody(
                 f"person_{person_id:03d}",
                 poses[person],
-                {"person": person_id, "kind": kinds[person_id], "body_model": model.name},
+                {"person": person_id, **known[person_id], "body_model": model.name},
             )
             for person, person_id in enumerate(persons.tolist())
         ]
@@ -434,13 +436,20 @@ def export_tables(
     fps = origin.spec.fps
     for clip in origin.clips:
         notes = {**describe_clip(origin, clip), "units": "in the name of each column"}
-        tracks = origin.tracks(clip)
+        notes["strides"] = "of people faster than 0.5 m/s, between two contacts of a foot"
+        notes["height_m"] = "of people placed by their feet alone"
+        tracks, people = origin.tracks(clip), best_results.describe_people(origin.run, clip)
+        kinds = {person: about["kind"] for person, about in people.items()}
+        names = {person: about.get("name", "") for person, about in people.items()}
         tables = {
-            "joints": joints_table(tracks, fps, best_results.person_kinds(origin.run, clip)),
+            "joints": joints_table(tracks, fps, kinds),
             "people": people_table(best_results.clip_positions(origin.run, clip), fps),
             "strides": strides_table(tracks, fps),
         }
         for name, table in tables.items():
+            if name != "people":  # whose positions have it
+                named = table["person"].map(names).astype(object)
+                table.insert(table.columns.get_loc("person") + 1, "name", named)
             yield from write(out / "tables" / f"{clip}.{name}.{suffix}", table, notes)
 
 

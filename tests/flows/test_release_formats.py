@@ -268,7 +268,8 @@ def tracked():
     }
 
 
-def test_files_for_tools_say_what_they_hold(match_folder, tmp_path):
+def test_files_for_tools_say_what_they_hold(match_folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(best_results, "names_of", lambda run, clip: {8: "walker"})
     run = replace(origin(match_folder, **tracked()), licence="For tests alone.")
     files = {form: write(form, run, tmp_path) for form in ("c3d", "csv", "mot", "gltf")}
     names = {path.relative_to(tmp_path).as_posix() for found in files.values() for path in found}
@@ -289,9 +290,16 @@ def test_files_for_tools_say_what_they_hold(match_folder, tmp_path):
     ]
     for text in texts:
         assert b"For tests alone." in text
+        assert b"usable" in text
         assert b"open-neutral/2 (CC0 1.0)" in text
     assert b"mixed" in texts[0] and b"mixed" in texts[2] and b'"kind":"mixed"' in texts[3]
     assert b"COCO-17 keypoints of the fitted body open-neutral/2" in texts[1]
+    assert b"two contacts of a foot" in texts[1] and b"by their feet alone" in texts[1]
+    assert b"walker" in texts[0] and b"walker" in texts[2] and b'"name":"walker"' in texts[3]
+    assert b"person_8" not in texts[0]
+    rows = (tmp_path / "tables/A_1.joints.csv").read_text().splitlines()
+    assert rows[0].startswith("frame,time_s,person,name,kind,")
+    assert {row.split(",")[3] for row in rows[1:] if ",8," in row[:20]} == {"walker"}
     unstated = replace(run, licence=None)
     write("c3d", unstated, tmp_path / "unstated")
     assert b"not stated" in (tmp_path / "unstated/markers/A_1/person_003.c3d").read_bytes()

@@ -19,6 +19,10 @@ HEALTHY = {
 
 UNHEALTHY = {"unhealthy_s.cam2": 2.2, "unhealthy_s.cam3": 3.0}
 UNHEALTHY |= {"unhealthy_from_frame.cam3": 0, "unhealthy_to_frame.cam3": 74}
+UNHEALTHY |= {"unhealthy_share": 0.5, "unhealthy_share.cam3": 0.5}  # said once, in seconds
+HALF = {"unhealthy_s.cam3": 0.867, "unhealthy_share": 0.5556, "unhealthy_share.cam3": 0.5556}
+HALF |= {"unhealthy_from_frame.cam3": 48, "unhealthy_to_frame.cam3": 99}
+MISSED = {"missed_share.cam1": 0.73, "missed_person.cam1": 1, "missed_share.cam2": 0.5}
 UNREADABLE = {"unreadable_share": 0.05, "unreadable_from_frame": 7, "unreadable_to_frame": 11}
 MISPLACED = {"misplacement_m.cam1": 0.05, "misplacement_m.cam4": 0.08}
 NO_NUMBER = {"misplacement_m.cam1": float("nan"), "misplacement_m.cam2": 0.01}
@@ -49,6 +53,12 @@ def test_a_healthy_run_is_usable_and_adjusted_cameras_replace_those_before():
         ("tracking/clip", {"corrections_refused": 2.0}, "2 corrections of clip do not"),
         ("retriangulation/clip", {"standard_deviation_m": 0.2}, "joints in clip are uncertain"),
         ("retriangulation/clip", UNHEALTHY, r"cam3, cam2 depart .* 3 s \(limit 2 s\) .* 0 to 74"),
+        ("retriangulation/clip", HALF, r"cam3 depart .* 55\.6 % \(limit 5 %\) .* 48 to 99\."),
+        (
+            "retriangulation/clip",
+            MISSED,
+            r"of cam1 lack .* 73 % \(limit 50 %\) .* person 1 in cam1\.",
+        ),
         ("retriangulation/clip", MISPLACED, r"cam4 displaces people in clip by 8 cm \(limit 5"),
         ("retriangulation/clip", {"filled_share": 0.1}, r"no camera sees 10 % \(limit 5 %\)"),
         ("bundle_adjustment/cameras", MOVED, "contradict the calibration of cam4: .* by 7.1"),
@@ -157,13 +167,29 @@ def test_failed_units_and_cameras_left_out_are_reservations():
         ({"lacks_people": True}, "no person is placed."),
         ({"waiting": 2}, "results that wait for review: 2."),
         ({"unit": "tracking/clip", "figures": {"absent_share": 0.6}}, "people are missing in"),
-        ({"unit": "tracking/clip", "figures": {"unmatched_share": 0.63}}, "no track follows more"),
+        ({"unit": "tracking/clip", "figures": {"unmatched_share": 0.63}}, "no track follows 63 %"),
     ],
 )
 def test_results_that_are_not_there_are_not_usable(outcome, said):
     found = judge(**{"unit": "x/y", **outcome})
     assert found.verdict == "not usable"
-    assert found.reservations[0].startswith(said)
+    (text,) = found.reservations  # the same number is not said with two limits
+    assert text.startswith(said)
+
+
+def test_the_cause_is_said_before_what_it_does_and_advice_fits_given_cameras():
+    figures = {"tracking/clip": {"unmatched_share": 0.63}, "static_calibration/cam1": {}}
+    figures["retriangulation/clip"] = HEALTHY["retriangulation/clip"] | MISPLACED
+    warnings = {"detection/cam1.clip": ["cam1.clip: people are 833 px tall."]}
+    cause, effect, misplaced = judge_run(
+        RunOutcome(figures=HEALTHY | figures, warnings=warnings), UsableLimits()
+    ).reservations
+    assert cause == "cam1.clip: people are 833 px tall."
+    assert effect.startswith("no track follows 63 % (limit 50 %)")
+    assert misplaced.endswith("Calibrate it anew.")
+    clicked = figures | {"static_calibration/cam1": {"clicks_wrong": 0.0}}
+    found = judge_run(RunOutcome(figures=HEALTHY | clicked), UsableLimits()).reservations
+    assert found[-1].endswith("Click more markings, where there are none.")
 
 
 def test_people_who_are_not_in_3d_are_places_that_can_be_used():

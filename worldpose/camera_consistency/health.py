@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from scipy.ndimage import convolve1d
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Flags, Floats
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import HEALTH_MEASURES
 from worldpose.geometry.cameras import Camera
@@ -35,11 +35,14 @@ class CameraHealth:
         length: frames of a bin.
         every: of this many frames, one is compared.
         sums: (bins, cameras, 2) number of terms, and sum of the robust loss of departures [1].
+        missed: (cameras, persons) number of compared frames in which a camera shows all limbs of a
+            person and has no detection of it.
     """
 
     length: int
     every: int
     sums: Floats
+    missed: Floats
 
     @classmethod
     def empty(cls, frames: int, cameras: int, persons: int, fps: float) -> CameraHealth:
@@ -47,7 +50,8 @@ class CameraHealth:
         length = max(1, round(0.2 * fps))
         # More frames cost time and tell little more.
         every = length if frames * cameras * persons > 50_000 else 1
-        return cls(length, every, np.zeros((-(-frames // length), cameras, 2)))
+        bins = -(-frames // length)
+        return cls(length, every, np.zeros((bins, cameras, 2)), np.zeros((cameras, persons)))
 
     @property
     def misfit(self) -> Floats:
@@ -99,6 +103,9 @@ class CameraHealth:
             own = 0.0 if variance is None else variance[frame, c, person][:, None]
             terms = _departures(cameras[c], pixels, joints[rows[frame], person][:, LIMBS], own)
             np.add.at(self.sums[:, c], bins[frame], terms)
+            frame, person = np.nonzero(slot < 0)
+            shown = _are_shown(cameras[c], joints[rows[frame], person][:, LIMBS])
+            np.add.at(self.missed[c], person[shown], 1.0)
 
 
 def _departures(camera: Camera, pixels: Floats, points: Floats, stated: Floats | float) -> Floats:
@@ -111,6 +118,12 @@ def _departures(camera: Camera, pixels: Floats, points: Floats, stated: Floats |
         loss = cauchy_loss(((pixels - image) ** 2).sum(axis=-1) / (variance + stated), 5.0)
     use = np.isfinite(loss) & (depth > 0.0)
     return np.stack([use.sum(axis=1), np.where(use, loss, 0.0).sum(axis=1)], axis=-1)
+
+
+def _are_shown(camera: Camera, points: Floats) -> Flags:
+    """Return whether a camera's image has all points of people (n, 12, 3) [m], (n,)."""
+    image = camera.project(points.reshape(-1, 3)).reshape(*points.shape[:-1], 2)
+    return np.asarray(((image >= 0.0) & (image < camera.image_size)).all(axis=(1, 2)))
 
 
 def judge_health(values: Floats) -> Floats:

@@ -42,7 +42,7 @@ def write_c3d(
         tracks: joints of several people.
         person: index of the person in `tracks`.
         fps: frames per second.
-        notes: texts for the group WORLDPOSE by parameter name.
+        notes: texts for the group WORLDPOSE by parameter name; `name` is the subject's.
 
     Raises:
         InputError: the clip has no or too many frames, or a note is too long.
@@ -55,7 +55,8 @@ def write_c3d(
         todo = "Choose another format, such as parquet, or shorter clips."
         raise InputError(str(path), expected, f"{count}", todo)
     names = tracks.markers.points
-    parameters = _parameters(f"person_{tracks.person_ids[person]}", names, count, fps, notes)
+    subject = notes.get("name") or f"person_{tracks.person_ids[person]}"
+    parameters = _parameters(subject, names, count, fps, notes)
     # The start of the data is itself a parameter, whose length does not depend on its value.
     start = 2 + len(_pad(_parameter_section(path, parameters))) // BLOCK
     parameters["POINT"]["DATA_START"] = np.int16(start)

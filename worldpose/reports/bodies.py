@@ -162,18 +162,19 @@ def plot_bodies(
 
 
 def crowded_part(camera: Camera, bodies: Floats) -> tuple[Floats, Floats]:
-    """Return corner and side lengths [px] of the part of an image that shows most people.
+    """Return corner and side lengths [px] of the part of an image that shows most people, whole.
 
     The camera is single; bodies are (persons, points, 3) [m], world.
     """
-    image_share = 0.3  # share of the camera's image to show: players of 80 px are then 210 px tall
+    image_share = 0.3  # least share of the image to show: players of 80 px are then 210 px tall
     size = np.asarray(camera.image_size, dtype=np.float64)
-    side = image_share * size
     middles = camera.project(bodies.mean(axis=1))
     inside: Flags = np.all((middles >= 0.0) & (middles < size), axis=-1)
     if not inside.any():
         return np.full(2, -0.5), size
-    middles = middles[inside]
+    pixels, middles = camera.project(bodies[inside]), middles[inside]
+    large = float(np.nanmax((np.nanmax(pixels, axis=1) - np.nanmin(pixels, axis=1)) / size))
+    side = min(1.0, max(image_share, 1.2 * large)) * size
     apart = np.abs(middles[:, None] - middles)
     together: Flags = np.all(apart < 0.45 * side, axis=-1)
     around = middles[together[np.argmax(together.sum(axis=1))]].mean(axis=0)

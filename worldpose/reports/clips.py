@@ -67,7 +67,7 @@ def plot_paths(
     overview, detail = figure.subplots(1, 2)
     for axes, (low, high) in ((overview, whole), (detail, close)):
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-        style_ground(axes)
+        style_ground(axes, pitch)
         if pitch is not None:
             draw_pitch(axes, pitch)
     for way in true_ways.swapaxes(0, 1):
@@ -158,7 +158,7 @@ def plot_stadium(
     figure.set_layout_engine("constrained")
     axes = figure.subplots()
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-    style_ground(axes)
+    style_ground(axes, pitch)
     ground = None
     if pitch is not None:
         draw_pitch(axes, pitch)

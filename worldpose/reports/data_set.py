@@ -186,7 +186,7 @@ def plot_statistics(statistics: DataSetStatistics) -> bytes:
     lengths = [clip.seconds for clip in statistics.clips.values()]
     figure = Figure(figsize=(14.0, 4.2), dpi=110, layout="constrained", facecolor="white")
     left, right = figure.subplots(1, 2)
-    _histogram(left, ways, "trajectory length per player [m]", "trajectories")
+    _histogram(left, ways, "trajectory length per person [m]", "trajectories")
     _histogram(right, lengths, "clip length [s]", "clips")
     people = statistics.subjects_per_frame
     figure.suptitle(

@@ -62,10 +62,11 @@ def draw_pitch(axes: Axes, pitch: PitchSpec) -> None:
         axes.plot(line[:, 0], line[:, 1], color=LINE, linewidth=1.2, zorder=1)
 
 
-def style_ground(axes: Axes) -> None:
-    """Style axes that show the ground from above, in metres of the world."""
-    axes.set_xlabel("x, along the touch line [m]", color=INK)
-    axes.set_ylabel("y, across [m]", color=INK)
+def style_ground(axes: Axes, pitch: PitchSpec | None) -> None:
+    """Style axes that show the ground from above, in metres of the world; None = no pitch."""
+    along, across = ("", "") if pitch is None else (", along the touch line", ", across")
+    axes.set_xlabel(f"x{along} [m]", color=INK)
+    axes.set_ylabel(f"y{across} [m]", color=INK)
     style(axes)
 
 

@@ -211,7 +211,7 @@ def _figure(caption: str, image: SmallImage) -> str:
 def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a table of plain text; the prefix ">" marks numeric columns."""
     kinds = [' class="number"' if column.startswith(">") else "" for column in columns]
-    lines = []
+    lines, long = [], ' class="long"'
     if any(columns):
         cells = (
             f"<th{kind}>{escape(column.removeprefix('>'))}</th>"
@@ -222,7 +222,7 @@ def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         cells = (
             f'<td class="bad">{escape(cell)}</td>'
             if isinstance(cell, Failure)
-            else f"<td{kind}>{escape(cell)}</td>"
+            else f"<td{kind or long * (len(cell) > 40)}>{escape(cell)}</td>"
             for kind, cell in zip(kinds, row, strict=True)
         )
         lines.append(f"<tr>{''.join(cells)}</tr>")

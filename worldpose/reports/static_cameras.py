@@ -150,7 +150,7 @@ def _draw_error_map(figure: Figure, error_map: ErrorMap, pitch: PitchSpec) -> No
     )
     for line in markings(pitch):
         axes.plot(line[:, 0], line[:, 1], color="white", linewidth=1.0, zorder=1)
-    style_ground(axes)
+    style_ground(axes, pitch)
     beside = figure.add_axes((0.83, 0.12 * high, 0.015, 0.76 * high))
     bar = figure.colorbar(shades, cax=beside, extend="both")
     bar.set_label("expected ground error [m]", color=INK)

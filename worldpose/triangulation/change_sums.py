@@ -148,10 +148,15 @@ class ChangeSums:
         return np.stack([shift, off[..., 0]], axis=-1)
 
     def sway(self, camera: int) -> tuple[float, float]:
-        """Return the usual size of a view's change in a second [rad], and its gain [1]."""
+        """Return the usual size of a view's change in a second [rad], and its gain [1].
+
+        Both are 0 below three seconds: two differ by one step, whatever moves the camera.
+        """
         own = WIDTH * camera + np.arange(WIDTH)
         matrix, score = self.matrix[:, own[:, None], own], self.score[:, own]
         second = np.flatnonzero(np.diff(self.rows // max(1.0, round(self.fps)), prepend=-1.0))
+        if len(second) < 3:
+            return 0.0, 0.0
         ends = np.append(second, len(self.rows))
         prior = np.diag(_INFORMATION)
         late, covariance = _solve_blocks(matrix, score, ends[:-1], ends[1:], prior)

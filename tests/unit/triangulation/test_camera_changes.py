@@ -22,7 +22,7 @@ from worldpose.triangulation.camera_changes import (
     refine_change,
     sum_clip,
 )
-from worldpose.triangulation.change_parts import Part, fit_parts
+from worldpose.triangulation.change_parts import Part, find_sway, fit_parts
 from worldpose.triangulation.change_sums import ChangeSums
 from worldpose.triangulation.clock_courses import (
     add_slow_drifts,
@@ -98,6 +98,19 @@ def test_a_camera_departs_no_farther_than_its_calibration_states(cameras):
     stated[:, BAD] = 40.0**2
     _, bad = measure(cameras, people, lambda joints: stated[: len(joints)])
     assert (bad == 0.0).all()
+
+
+def test_health_counts_the_people_whom_a_camera_shows_and_has_not_found(cameras):
+    people = view(cameras, lambda pixels, *_: pixels)
+    joints = triangulate_views(Rig.from_cameras(cameras), people, SETTINGS)
+    people.detection_index[:180, BAD, 1] = -1
+    health = CameraHealth.empty(FRAMES, 4, people.detection_index.shape[2], FPS)
+    health.add(cameras, people, joints, 0)
+    joints[:, 1] += [0.0, 0.0, 500.0]  # out of the images
+    health.add(cameras, people, joints, 0)
+    expected = np.zeros_like(health.missed)
+    expected[BAD, 1] = 179 / health.every
+    assert health.missed == pytest.approx(expected, abs=1.0)
 
 
 def test_health_tells_images_that_are_missing_dark_or_blurred(cameras):
@@ -246,6 +259,17 @@ def test_a_camera_that_meets_its_only_person_no_more_is_told(cameras, spoil, lon
     confidence = confidence * np.isfinite(pixels[..., 0])
     seen = KeypointDetections.from_keypoints(pixels, confidence, index, frame)
     assert find_lone_views(cameras, seen, joints, FPS) == lone
+
+
+@pytest.mark.parametrize(("seconds", "found"), [(2, None), (4, BAD)])
+def test_one_difference_between_two_seconds_is_no_sway(cameras, seconds, found):
+    def jump(pixels, frame, _):
+        return pixels + 60.0 * (frame // round(FPS) % 2)[..., None] * np.array([1.0, 0.5])
+
+    people = view(cameras, jump)[: seconds * round(FPS)]
+    sums = sum_clip(cameras, people, FPS, np.arange(seconds * round(FPS)), settings=SETTINGS)
+    swaying = find_sway(sums, sums, [])
+    assert (None if swaying is None else swaying[0]) == found
 
 
 def test_a_camera_that_sways_is_not_explained(cameras):
