@@ -334,11 +334,10 @@ def _print_offsets(offsets: ClockOffsets, plot: Path | None, *, applied: bool) -
     console.print_table("clock offsets, in frames of each camera", head, shown)
     if plot is not None:
         console.line(f"wrote {plot}")
-    if not changed:
-        console.line("match.yaml needs no change.")
-    elif applied:
+    console.line(offsets.verdict)
+    if applied and changed:
         console.line(f"wrote offset_frames of {', '.join(changed)} into match.yaml")
-    else:
+    elif changed:
         console.line("Add --apply to write the proposed offsets into match.yaml.")
     if offsets.has_rest:
         console.line(

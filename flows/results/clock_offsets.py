@@ -65,6 +65,18 @@ class ClockOffsets(NamedTuple):
         return {row.camera: row.proposed for row in self.rows if row.proposed != row.stated}
 
     @property
+    def verdict(self) -> str:
+        """Which of the offsets that stay the people confirm, and which they do not tell."""
+        stay = [row for row in self.rows if row.proposed == row.stated]
+        told = [row.camera for row in stay if row.found is not None]
+        untold = [row.camera for row in stay if row.found is None]
+        said = [f"The people confirm the offsets of {', '.join(told)}."] if told else []
+        if untold:
+            rest = f"Nothing tells the offsets of {', '.join(untold)}: they stay, right or wrong."
+            said.append(rest)
+        return " ".join(said)
+
+    @property
     def warning(self) -> str:
         """A sentence about cameras that cannot be compared; empty if all can."""
         apart = [", ".join(self.names[c] for c in group) for group in self.found.groups]

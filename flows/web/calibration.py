@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from data_contracts.arrays import Image
+from data_contracts.cameras import CameraCalibration
 from data_contracts.match import Side
 from data_contracts.pitch import PitchSpec
 from data_contracts.records import Name, Record
@@ -112,30 +113,40 @@ def routes(context: PageContext) -> APIRouter:
     pictures = Pictures()
     drawings: dict[str, tuple[PitchSpec, PitchDrawing]] = {}
 
-    def open_picture(match_id: str, owner: str) -> tuple[Match, PitchDrawing, tuple[int, int]]:
-        """Return a match, its pitch as it is now, and the size of the camera's images."""
+    def open_camera(match_id: str, owner: str) -> tuple[Match, tuple[int, int]]:
+        """Return a match, and the size of the camera's images."""
         match = context.match(match_id)
-        pitch, camera = match.folder.pitch, match.folder.spec.filming_camera(owner)
-        if pitch is None:
-            raise HTTPException(404, "the match has no pitch")
+        camera = match.folder.spec.filming_camera(owner)
         if camera is None:
             raise HTTPException(404, "no such camera")
+        return match, (camera.width, camera.height)
+
+    def open_picture(match_id: str, owner: str) -> tuple[Match, PitchDrawing, tuple[int, int]]:
+        """Return a match, its pitch as it is now, and the size of the camera's images."""
+        match, size = open_camera(match_id, owner)
+        pitch = match.folder.pitch
+        if pitch is None:
+            raise HTTPException(404, "the match has no pitch")
         if match_id not in drawings or drawings[match_id][0] != pitch:
             drawings[match_id] = pitch, PitchDrawing(PitchTemplate.from_spec(pitch))
-        return match, drawings[match_id][1], (camera.width, camera.height)
+        return match, drawings[match_id][1], size
 
     @router.get("")
     def picture(match_id: str, owner: str, frame: int | None = None) -> dict[str, Any]:
-        match, drawing, size = open_picture(match_id, owner)
-        given, markings = match.folder.calibrations.get(owner), {}
-        if given is not None:
-            markings = _round_pieces(drawing.project_markings(Camera.from_calibration(given)))
-        seen = {"size": size, "pitch": _pitch(drawing), "markings": markings}
-        return {**seen, **_describe(context, match, owner, frame)}
+        match, size = open_camera(match_id, owner)
+        given, seen = match.folder.calibrations.get(owner), {"pitch": None, "markings": {}}
+        if match.folder.pitch is not None:
+            drawing = open_picture(match_id, owner)[1]
+            seen["pitch"] = _pitch(drawing)
+            if given is not None:
+                pieces = drawing.project_markings(Camera.from_calibration(given))
+                seen["markings"] = _round_pieces(pieces)
+        pose = None if given is None else _describe_pose(given)
+        return {**seen, "size": size, "pose": pose, **_describe(context, match, owner, frame)}
 
     @router.get("/image")
     def image(match_id: str, owner: str, frame: int | None = None) -> Response:
-        content = pictures.png(open_picture(match_id, owner)[0], owner, frame)
+        content = pictures.png(open_camera(match_id, owner)[0], owner, frame)
         return Response(content, media_type="image/png")
 
     @router.post("/preview")
@@ -197,8 +208,27 @@ def _describe(context: PageContext, match: Match, owner: str, frame: int | None)
             if unit in each.request.keys and each.is_current
         ],
         "cameras": [camera.id for camera in match.folder.spec.static_cameras],
+        "clip": next((clip.id for clip in match.folder.spec.clips_of(owner)), None),
         "key_frames": key_frames(match, owner),
     }
+
+
+def _describe_pose(given: CameraCalibration) -> list[str]:
+    """Return where a given camera stands, where it looks, and its lens, a sentence each."""
+    camera = Camera.from_calibration(given)
+    x, y, z = camera.center.tolist()
+    along = np.asarray(given.rotation)[2]
+    tilt = float(np.degrees(np.arcsin(np.clip(along[2], -1.0, 1.0))))
+    turn = float(np.degrees(np.arctan2(along[1], along[0])))
+    focal, middle = given.focal_px, given.principal_point_px
+    bends = ", ".join(f"{value:.4g}" for value in given.distortion)
+    return [
+        f"It stands at x {x:.2f} m, y {y:.2f} m, z {z:.2f} m.",
+        f"It looks {abs(tilt):.0f}° {'down' if tilt < 0 else 'up'}, to {turn:.0f}° from the x axis "
+        "(y is at 90°).",
+        f"Focal length {focal[0]:.1f} and {focal[1]:.1f} px, principal point ({middle[0]:.1f}, "
+        f"{middle[1]:.1f}) px, lens model {given.lens_model} with distortion {bends}.",
+    ]
 
 
 def _propose(

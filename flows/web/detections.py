@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final
@@ -31,6 +31,7 @@ from flows.web.images import image_response
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.review.evidence import check_views, epipolar_curves
+from worldpose.review.identities import Identities
 from worldpose.store.store import Store, open_run
 
 MAX_LISTED: Final = 60
@@ -194,13 +195,19 @@ def _queue(store: Store, match: Match, owner: str) -> dict[str, Any]:
             each.score[:MAX_LISTED],
             strict=True,
         )
-    )
+    )[:MAX_LISTED]
+    names = _name_people(store, match, owner, [(frame, k) for _, frame, k in rows])
     return {
         "left": sum(len(each.frame) for each in left),
         "people": sum(each.people for each in left),
         "next": [
-            {"frame": frame, "detection": detection, "score": round(score, 3)}
-            for score, frame, detection in rows[:MAX_LISTED]
+            {
+                "frame": frame,
+                "detection": detection,
+                "called": names[frame, detection],
+                "score": round(score, 3),
+            }
+            for score, frame, detection in rows
         ],
     }
 
@@ -211,7 +218,44 @@ def _read_frame(store: Store, match: Match, owner: str, frame: int) -> dict[str,
         found = detections_now(store, match, owner, frame)
     except InputError as error:  # the image can be looked at
         return {"people": [], "free": 0, "note": describe_error(error)}
-    return {**_describe_frame(found), "note": ""}
+    told = _describe_frame(found)
+    names = _name_people(
+        store, match, owner, [(frame, each["detection"]) for each in told["people"]]
+    )
+    for each in told["people"]:
+        each["called"] = names[frame, each["detection"]]
+    return {**told, "note": ""}
+
+
+def _find_tracks(store: Store, match: Match, owner: str, frame: int) -> Identities | None:
+    """Return the tracks of a frame's clip; None if there are none of this camera."""
+    clip = next(iter(match.folder.spec.clips_with(frame)), None)
+    try:
+        found = None if clip is None else identities_now(store, match, clip.id).identities
+    except InputError:
+        return None  # no tracks yet
+    return None if found is None or owner not in found.cameras else found
+
+
+def _name_people(
+    store: Store, match: Match, owner: str, places: Iterable[tuple[int, int]]
+) -> dict[tuple[int, int], str]:
+    """Return what the page calls people, by frame and detection: as their tracks are called."""
+    roster = {each.id: each.name or each.id for each in match.folder.spec.roster}
+    clips: dict[tuple[str, ...], Identities | None] = {}
+    names = {}
+    for frame, detection in places:
+        clip = tuple(each.id for each in match.folder.spec.clips_with(frame))
+        if clip not in clips:
+            clips[clip] = _find_tracks(store, match, owner, frame)
+        found, names[frame, detection] = clips[clip], f"detection {detection}, in no track"
+        if found is None or frame not in found.frame:
+            continue
+        here = found.detection_index[np.searchsorted(found.frame, frame)]
+        for person in found.person[here[found.cameras.index(owner)] == detection].tolist():
+            name = found.names.get(person, f"person {person}")
+            names[frame, detection] = roster.get(name, name)
+    return names
 
 
 def _describe_frame(found: KeypointDetections) -> dict[str, Any]:
@@ -290,16 +334,11 @@ def _add_views(router: APIRouter, context: PageContext) -> None:
 
 def _group(context: PageContext, match: Match, owner: str, frame: int, detection: int) -> Group:
     """Return a detection's person by tracks and corrections, with its detections in all cameras."""
-    clip = next(iter(match.folder.spec.clips_with(frame)), None)
     cameras = static_cameras(open_run(context.store.url, match.match_id), match.folder.spec)
     names = list(cameras)
     detections = [detection if name == owner else -1 for name in names]
-    person = None
-    try:
-        found = None if clip is None else identities_now(context.store, match, clip.id).identities
-    except InputError:
-        found = None  # no tracks yet
-    if found is not None and owner in found.cameras and frame in found.frame:
+    person, found = None, _find_tracks(context.store, match, owner, frame)
+    if found is not None and frame in found.frame:
         here = found.detection_index[int(np.searchsorted(found.frame, frame))]
         (who,) = np.nonzero(here[found.cameras.index(owner)] == detection)
         if len(who):

@@ -90,6 +90,7 @@ def routes(context: PageContext, intake: Intake | None) -> APIRouter:
             "clip": found.clip,
             "cameras": [row._asdict() for row in found.rows],
             "changed": found.changed,
+            "verdict": found.verdict,
             "warning": found.warning,
             "has_rest": found.has_rest,
         }

@@ -230,6 +230,7 @@ def _clip(context: PageContext, match: Match, clip: str) -> dict[str, Any]:
         frames = {"first_frame": spec.first_frame, "frame_count": spec.frame_count}
     return {
         "id": clip,
+        "fps": match.folder.spec.fps,
         **frames,
         "cameras": filmed,
         "has_video": clip in match.folder.videos,

@@ -34,6 +34,8 @@ from flows.results.comparison import SubjectChange, compare_runs, paired_people
 from flows.results.export import export
 from flows.results.outputs import OWNERS
 from flows.results.possible_exports import impossible_exports
+from flows.results.run_cameras import broadcast_views
+from flows.results.tool_exports import image_views
 from flows.review.identities import names_said
 from flows.stage import Match
 from flows.web.app_context import PageContext
@@ -190,6 +192,14 @@ def routes(context: PageContext) -> APIRouter:
         shown_clip = open_clip(match_id, clip, run_id)
         return Response(encode_frames(shown_clip, first, count), media_type=BINARY)
 
+    @router.get("/scenes/{clip}/views/{camera}")
+    def view(
+        match_id: str, clip: str, camera: str, frame: int, run_id: Name = LATEST
+    ) -> dict[str, Any]:
+        shown_clip = open_clip(match_id, clip, run_id)
+        match, run = open_asked(match_id, run_id)
+        return {"people": _project(Origin(run, match.registration), shown_clip, camera, frame)}
+
     @router.get("/report")
     def report(match_id: str, run_id: Name = LATEST) -> FileResponse:
         match, run = open_asked(match_id, run_id)
@@ -242,6 +252,37 @@ def routes(context: PageContext) -> APIRouter:
         )
 
     return router
+
+
+def _project(origin: Origin, clip: ViewerClip, camera: str, frame: int) -> list[dict[str, Any]]:
+    """Return the people in 3D where a camera's image of a match frame shows them.
+
+    There is nobody in frames without results, and in a camera that the run does not use.
+    """
+    row = frame - int(clip.frames[0])
+    if not 0 <= row < len(clip.frames):
+        return []
+    near = slice(max(0, row - 1), row + 2)
+    views = image_views(origin, clip.clip, clip.frames[near], corrected=True)
+    view = next((each for each in views if each.name == camera), None)
+    if view is None:
+        return []
+    pixels = view.project(view.at_images(clip.joints[near]))[row - near.start]
+    size = view.camera.image_size
+    with np.errstate(invalid="ignore"):
+        is_near = (np.abs(pixels - size / 2) < 2 * size).all(axis=-1)  # no number is too long
+    return [
+        {
+            "person": each.person,
+            "name": each.name,
+            "keypoints": [
+                np.round(xy, 1).tolist() if known else None
+                for xy, known in zip(places, there, strict=True)
+            ],
+        }
+        for each, places, there in zip(clip.people, pixels, is_near, strict=True)
+        if there.any()
+    ]
 
 
 def _describe_results(context: PageContext, match: Match, run: Run) -> dict[str, Any]:

@@ -39,7 +39,7 @@ const matchOf = (run, reviews) => ({
   waiting: reviews.filter((each) => each.state === "waits").map(({ id, unit }) => ({ id, unit, rejected: false })), reviews, to_click: [], groups: [],
   state: { name: "ready", words: "ready", why: "", todo: "", seconds: null, units: {} },
   cameras: ["north", "south"].map((id) => ({ id, given: true, clicks: 0, has_picture: false, figures: {} })),
-  clips: [{ id: "half", first_frame: 100, frame_count: 200, cameras: ["north"], has_video: false, key_frames: [], pick_next: [], has_tracks: true }],
+  clips: [{ id: "half", fps: 25, first_frame: 100, frame_count: 200, cameras: ["north"], has_video: false, key_frames: [], pick_next: [], has_tracks: true }],
   failures: [], stages: [], next_versions: [], left_out: {}, warnings: [],
 });
 const resultsOf = (run) => ({
@@ -47,7 +47,7 @@ const resultsOf = (run) => ({
   impossible: { minimap: "The match has no pitch." },
   clips: [{ id: "half", video: null, without_joints: null }],
 });
-const trackOf = (id, name) => ({ id, name, seen: { north: 1 }, segments: [[100, 299]], views: 2, way: [[0, 0]] });
+const trackOf = (id, name) => ({ id, name, seen: { north: 1 }, segments: [[100, 299]], views: 2, way: Array(200).fill([0.4 * (id - 7), 0]) });
 
 // A new run while the page is open; two names at once; two downloads at once.
 async function showNewRun() {
@@ -63,7 +63,7 @@ async function showNewRun() {
     if (path === "/api/matches/final") return matchOf(run, []);
     if (path.endsWith("/results")) return resultsOf(run);
     if (path.endsWith("/metrics")) return { metrics: [{ kind: "camera", name: "north", values: { "x clicks_wrong": Number(run) } }], names: {}, before: null, problem: "", changes: [], unchanged: 0 };
-    if (path.endsWith("/offsets")) return body ? {} : { clip: "half", cameras: [], changed: { south: Number(run) }, warning: "" };
+    if (path.endsWith("/offsets")) return body ? {} : { clip: "half", cameras: [], changed: { south: Number(run) }, verdict: `told of ${run}`, warning: "" };
     if (path.endsWith("/runs")) return [];
     if (path.endsWith("/corrections")) {
       const { edit } = body.edits[0];
@@ -81,7 +81,7 @@ async function showNewRun() {
   await page.click("[data-apply]");
   const look = async () => [
     (await page.locator('[data-metrics="camera"] tbody').innerText()).trim(), await page.locator("[data-clocks] img").getAttribute("src"),
-    await page.locator("[data-clocks] [role=status]").count(),
+    await page.locator("[data-clocks] [role=status]").count(), await page.locator("[data-verdict]").innerText(),
   ];
   await page.waitForSelector("[data-clocks] [role=status]");
   seen.before = await look();
@@ -120,6 +120,18 @@ async function showNewRun() {
   await wait(4);
   seen.names = sent;
   seen.crops = [...new Set(crops)];
+  // Keys move by a frame, a second, or to an end; people on a map of 40 cm are neither large nor cut off.
+  await page.click('[data-person="7"]');
+  seen.moves = [];
+  for (const key of ["Home", "ArrowRight", "Shift+ArrowRight", "ArrowLeft", "End"]) {
+    await page.keyboard.press(key);
+    await wait(0.2);
+    seen.moves.push((await page.locator("[data-tracks] .top .soft").first().innerText()).match(/frame (\d+)/)[1]);
+  }
+  const shapes = (kind) => page.locator(`[data-tracks] svg ${kind}`).evaluateAll((all) => all.map((each) => each.getBoundingClientRect().toJSON()));
+  const [map] = await page.locator("[data-tracks] svg").evaluateAll((all) => all.map((each) => each.getBoundingClientRect().toJSON()));
+  seen.discs = (await shapes("circle")).map((each) => Math.round(each.width));
+  seen.cut = (await shapes("text")).filter((each) => each.left < map.left || each.right > map.right || each.top < map.top).length;
   // Nobody is seen before the first frame; two people are joined without Shift, and not those of a question in between.
   await page.click('[data-person="7"] .bar', { position: { x: 1, y: 4 } });
   seen.split = [await page.locator("[data-split]").innerText(), await page.locator("[data-tracks] button >> text=Split").isDisabled()];
@@ -222,11 +234,21 @@ async function click() {
 
 // An image that the server refuses, and a camera that is given.
 async function refuse() {
-  await at_server("picture/final/north", (path) => (path === "/api/session" ? session : { given: true, has_picture: false, size: [1920, 1080], markings: { line: [[[0, 0], [900, 900]]] } }));
+  await at_server("picture/final/north", (path) => (path === "/api/session" ? session : { given: true, pose: ["It stands."], pitch: {}, has_picture: false, size: [1920, 1080], markings: { line: [[[0, 0], [900, 900]]] } }));
   seen.given = await page.waitForSelector("[data-given] canvas").then(() => true, () => false);
+  // Without a pitch the people tell whether the camera is right.
   await at_server("picture/final/north", (path) => {
     if (path === "/api/session") return session;
-    return path.endsWith("/image") ? [422, { error: "north.png: expected a PNG image, found damaged bytes" }] : { has_picture: true };
+    if (path.endsWith("/results")) return resultsOf("0001");
+    if (path.endsWith("/views/north")) return { people: [{ person: 7, name: "", keypoints: [[30, 30], [40, 60]] }] };
+    if (path.endsWith("/detections/north")) return { frame: 100, frames: [[100, 299]], size: [100, 100], has_picture: false, joints: ["nose", "left_eye"], bones: [[0, 1]], free: 0, note: "", people: [], cameras: ["north"] };
+    return { given: true, pose: ["It stands."], pitch: null, clip: "half", has_picture: false, size: [100, 100], markings: {} };
+  });
+  await page.locator("[data-placed] line").first().waitFor({ state: "attached", timeout: 4000 }).catch(() => {});
+  seen.lab = [await page.locator("[data-placed] line").count(), await page.locator("main >> text=It stands.").count(), await page.locator("main button >> text=Add files").count()];
+  await at_server("picture/final/north", (path) => {
+    if (path === "/api/session") return session;
+    return path.endsWith("/image") ? [422, { error: "north.png: expected a PNG image, found damaged bytes" }] : { pitch: {}, has_picture: true };
   });
   seen.refused = await page.locator("main [role=alert]").innerText();
 }
@@ -249,7 +271,7 @@ async function step() {
     if (!path.endsWith("/detections/north")) return [404, {}];
     early += saving;
     const frame = Number(new URLSearchParams(search).get("frame") ?? 150);
-    const people = [{ detection: 0, box: [10, 10, 50, 90], score: 1, keypoints: [[30, 30]], confidence: [1] }];
+    const people = [{ detection: 0, called: "kane", box: [10, 10, 50, 90], score: 1, keypoints: [[30, 30]], confidence: [1] }];
     return { frame, frames: [[200, 299], [100, 199]], size: [100, 100], has_picture: false, joints: ["nose"], bones: [], free: 1, note: "", cameras: ["north"], people };
   });
   await page.click("[data-edit]");
@@ -260,6 +282,14 @@ async function step() {
   await page.locator("aside > table tbody tr").click();
   await page.locator("aside [role=alert]").waitFor({ timeout: 3000 }).catch(() => {});
   seen.views = await page.locator("aside [role=alert]").allInnerTexts();
+  seen.called = [await page.locator("[data-called]").innerText(), await page.locator("aside > table tbody td").first().innerText()];
+  // On a phone the picture stays in view while the tools are scrolled.
+  await page.setViewportSize({ width: 390, height: 800 });
+  await page.locator("aside > table").scrollIntoViewIfNeeded();
+  await page.locator("aside > table").evaluate((table) => table.scrollIntoView({ block: "end" }));
+  await wait(0.5);
+  seen.phone = await page.evaluate(() => ["[data-player] .picture", "aside > table"].map((part) => document.querySelector(part).getBoundingClientRect()).map(({ top, bottom }) => top >= 0 && bottom <= innerHeight + 1));
+  await page.setViewportSize({ width: 1366, height: 768 });
   await page.keyboard.press("x");
   run = "0002"; // its people are shown when the correction is saved, and none is chosen
   await wait(7);

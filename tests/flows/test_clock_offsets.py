@@ -60,7 +60,9 @@ def test_an_offset_is_found_drawn_and_written(server, shifted, tmp_path):
     assert applied == {"cam02": 0}
     cameras = yaml.safe_load((shifted / "match.yaml").read_text())["cameras"]
     assert [camera.get("offset_frames", 0) for camera in cameras] == [0] * len(cameras)
-    assert "match.yaml needs no change" in succeed("synchronize", shifted, *options[:2]).out
+    again = succeed("synchronize", shifted, *options[:2]).out
+    assert f"The people confirm the offsets of {', '.join(rows)}.\n" in again
+    assert "--apply" not in again
 
 
 def test_the_table_of_offsets_names_the_reference_and_the_unit(monkeypatch):
@@ -74,6 +76,16 @@ def test_the_table_of_offsets_names_the_reference_and_the_unit(monkeypatch):
         ("left", "4", "-", "-", "4", "the reference: its offset stays"),
         ("right", "4", "4.00", "0.50", "4", "relative to left"),
     ]
+
+
+def test_an_offset_that_nothing_tells_is_not_called_right(capsys):
+    rows = [Proposal("left", 4, 4.0, 0.5, 4, "", "left"), Proposal("right", 0, None, None, 0, "?")]
+    for shown, told in ((rows, True), (rows[1:], False)):
+        _print_offsets(ClockOffsets("clip", ["left", "right"], None, shown), None, applied=False)
+        said = capsys.readouterr().out
+        assert ("The people confirm the offsets of left." in said) == told
+        assert "Nothing tells the offsets of right: they stay, right or wrong." in said
+        assert "no change" not in said
 
 
 @pytest.mark.slow

@@ -1,15 +1,18 @@
 """Corrections on pages: kept for all, overwriting no other's, in groups, and undone together."""
 
+import json
 import shutil
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 
+import numpy as np
 import page_client
 import pytest
 from command_line import TINY
 from long_journal import SESSION, write_corrections
 from page_client import MATCH, a_click, moved
+from run_records import calibration
 
 from data_contracts.review import Withdrawal
 from flows.registering import open_for_review, open_match, register
@@ -18,6 +21,8 @@ from flows.web import app_context
 from flows.web.corrections import SESSION_GAP
 from worldpose.errors import StoreError
 from worldpose.formats.calibration_forms import read_calibration
+from worldpose.formats.calibration_writer import write_calibration_toml
+from worldpose.ingest.footage import write_still
 from worldpose.review.journal import read_journal
 from worldpose.store.store import Store
 
@@ -132,6 +137,41 @@ def test_a_match_that_nobody_clicked_is_clicked_from_nothing(
     clicked["points"][name] = [place[0] + 0.5, place[1]]
     ada.post(f"{pictures}/preview", json=clicked)  # while it is dragged
     assert expected()["cam01"] == {}
+
+
+def test_a_camera_of_a_match_without_a_pitch_says_where_it_stands(
+    unrun_store, ada_before_runs, tmp_path
+):
+    folder = tmp_path / "lab"
+    (folder / "stills").mkdir(parents=True)
+    cameras = [{"id": name, "width": 64, "height": 48} for name in "ab"]
+    clips = [{"id": "trial", "frame_count": 10}]
+    about = {"contract": 1, "match_id": "lab", "fps": 25, "pitch": "none"}
+    (folder / "match.yaml").write_text(json.dumps({**about, "cameras": cameras, "clips": clips}))
+    # It stands at (1, -3, 2) m, and looks to y, 30 degrees down.
+    sine, cosine = 0.5, 3**0.5 / 2
+    given = calibration(
+        "a",
+        image_size=(64, 48),
+        focal_px=(50.0, 50.0),
+        principal_point_px=(31.5, 23.5),
+        rotation=((1.0, 0.0, 0.0), (0.0, -sine, -cosine), (0.0, cosine, -sine)),
+        translation=(-1.0, 2.0 * cosine - 3.0 * sine, 2.0 * sine + 3.0 * cosine),
+    )
+    write_calibration_toml(folder / "calibration.toml", {"a": given})
+    write_still(folder / "stills" / "a.png", np.full((48, 64, 3), 90, np.uint8))
+    register(unrun_store, folder, unfinished=True)
+    path = "/api/matches/lab/pictures"
+    seen = ada_before_runs.get(f"{path}/a").json()
+    assert (seen["pitch"], seen["given"], seen["clip"]) == (None, True, "trial")
+    assert seen["pose"][:2] == [
+        "It stands at x 1.00 m, y -3.00 m, z 2.00 m.",
+        "It looks 30° down, to 90° from the x axis (y is at 90°).",
+    ]
+    assert ada_before_runs.get(f"{path}/a/image").status_code == 200
+    other = ada_before_runs.get(f"{path}/b").json()
+    assert (other["pose"], other["given"]) == (None, False)
+    assert ada_before_runs.post(f"{path}/a/preview", json={}).status_code == 404
 
 
 def test_a_page_shows_the_pitch_as_it_was_corrected(ada, project_copy, tiny, monkeypatch):

@@ -73,6 +73,22 @@ def test_other_cameras_say_where_they_expect_a_keypoint(reader, tiny_run):
         name: seen[name] for name in others
     }
     assert all(each["curves"] == [] for each in found["views"])  # of no joint
+    # The page calls the person as the track is called; and it shows the person in 3D in the image.
+    shown = reader.get(f"{MATCH}/detections/{camera}", params={"frame": frame}).json()["people"]
+    (here,) = (each for each in shown if each["detection"] == seen[camera])
+    assert here["called"] == f"person {person}"
+    scene = f"{MATCH}/results/scenes/clip/views/{camera}"
+    placed = {
+        each["person"]: each for each in reader.get(scene, params={"frame": frame}).json()["people"]
+    }
+    pairs = [
+        pair
+        for pair in zip(here["keypoints"], placed[person]["keypoints"], strict=True)
+        if all(pair)
+    ]
+    assert len(pairs) > 8
+    assert np.median([np.linalg.norm(np.subtract(*pair)) for pair in pairs]) < 8.0  # [px]
+    assert reader.get(scene, params={"frame": 99999}).json() == {"people": []}
     errors = np.array(found["here"]["error"], dtype=float)
     joint = int(np.nanargmin(errors))
     expected = found["here"]["expected"][joint]
@@ -138,6 +154,7 @@ def test_who_is_certain_is_accepted_at_once_and_the_rest_one_by_one(ada, bob, pr
     queue = ada.get(f"{path}/queue").json()
     assert queue["left"] == queue["people"] == len(known)
     assert [each["score"] for each in queue["next"]] == pytest.approx(known[:60], abs=5e-4)
+    assert {each["called"].split()[0] for each in queue["next"]} == {"person", "detection"}
     least = float(known[len(known) // 2])
     queue = ada.post(f"{path}/acceptances", json={"at_least": least}).json()
     assert queue["left"] == (known < np.float32(least)).sum()

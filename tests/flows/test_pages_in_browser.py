@@ -152,14 +152,18 @@ def test_pages_lose_and_repeat_nothing_at_a_slow_or_refusing_server(tmp_path):
     seen = drive(STUBBED, {"static": str(STATIC)}, tmp_path, 200)
     # What is open shows a new run, and asks for nothing of two runs.
     plot = "/api/matches/final/offsets/plot?run_id="
-    assert seen["before"] == ["north\t1", f"{plot}0001", 1]
-    assert seen["after"] == ["north\t2", f"{plot}0002", 0]
+    assert seen["before"] == ["north\t1", f"{plot}0001", 1, "told of 0001"]
+    assert seen["after"] == ["north\t2", f"{plot}0002", 0, "told of 0002"]
     assert seen["scenes"] == ["?run_id=0001", "?run_id=0002"]
     # What is asked for while something is saved or written waits for its turn.
     assert (seen["begun"], seen["names"]) == ("kane", ["kane", "rice"])
     assert seen["crops"] == ["0001", "0002"]
     assert seen["split"] == ["To split kane, move to a frame after 100, and not after 299.", True]
     assert (seen["pair"], seen["given"]) == ([7, 8], True)
+    assert seen["moves"] == ["100", "101", "126", "125", "299"]
+    assert (seen["discs"], seen["cut"]) == ([12, 8], 0)  # [px]
+    assert (seen["lab"], seen["called"]) == ([1, 1, 1], ["kane", "kane"])
+    assert seen["phone"] == [True, True]
     assert seen["written"] == ["usd?run_id=0002", "c3d?run_id=0002"]
     assert "minimap The match has no pitch." in seen["impossible"][0] and seen["impossible"][1] == 0
     assert seen["alerts"] == [1, 0] and seen["covered"] < 800 / 4

@@ -14,3 +14,7 @@ export const isHeld = (event, more = "") => event.repeat && !/^(Arrow\w+|Tab|[-+
 let area = "";
 export const enter = (name) => (area = name);
 export const isIn = (...names) => area === "" || names.includes(area);
+
+// By how many frames a key moves on: by one, with Shift by a second, or to an end; 0 of another key.
+const MOVES = { ArrowLeft: -1, ArrowRight: 1, Home: -Infinity, End: Infinity };
+export const moveOf = (event, fps) => (event.altKey ? 0 : (MOVES[event.key] ?? 0) * (event.shiftKey ? Math.round(fps) : 1));

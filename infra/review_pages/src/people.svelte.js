@@ -13,6 +13,8 @@ export class People {
   done = $state([]); // ids of corrections made here
   busy = $state(false);
 
+  scene = null; // address of the people in 3D, with its run; null without any
+
   #last = Promise.resolve();
   #pending = 0; // steps that are not done yet
   #frame = null; // the frame asked for last
@@ -34,6 +36,7 @@ export class People {
     this.#frame = number;
     try {
       const found = await get(number === null ? this.where : `${this.where}?frame=${number}`);
+      found.placed = await this.#placed(found);
       if (number !== this.#frame) return; // another one is wanted now
       this.info = found;
       if (!found.people.some((each) => each.detection === this.who)) this.choose(null);
@@ -41,6 +44,18 @@ export class People {
       this.problem = "";
     } catch (error) {
       this.problem = error.message;
+    }
+  }
+
+  // The people in 3D, projected into the image.
+  async #placed(found) {
+    if (!this.scene) return [];
+    const [address, run] = this.scene.split("?");
+    try {
+      return (await get(`${address}/views/${encodeURIComponent(this.owner)}?${run}&frame=${found.frame}`)).people;
+    } catch (error) {
+      found.note ||= `The people in 3D are not shown: ${error.message}`;
+      return [];
     }
   }
 
