@@ -41,6 +41,7 @@ from worldpose.body_fitting.results import BodyFit, ClipEvidence, EvidenceSource
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.shapes import Shapes, fit_shapes, spread_intervals
 from worldpose.compiled import map_in_threads
+from worldpose.errors import InputError
 
 WINDOW_FRAMES = 3000
 """Frames that are solved together: a person's equations take 60 KB per frame."""
@@ -63,8 +64,17 @@ def fit_bodies(
         known_shapes: shapes of people from other clips, by their index in the joints.
 
     Raises:
-        InputError: a covariance is smaller than the square of `common_bias`, its part.
+        InputError: a covariance is smaller than the square of `common_bias`, its part, or
+            `settings.method` is not ours.
     """
+    if settings.method != "worldpose":
+        raise InputError(
+            "fit_bodies: method",
+            expected="worldpose: the paper's method fits 2D poses, which joints do not have",
+            found=settings.method,
+            todo="Call `worldpose.body_fitting.paper_variant.fit_in_windows`, or set "
+            "body_fitting.method of a run.",
+        )
     parts = fit_in_windows(model, evidence, settings, ground, known_shapes)
     return BodyFit.concatenate([fit for _, fit in parts])
 

@@ -35,7 +35,7 @@ from worldpose.body_fitting.results import BodyFit
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.compiled import map_in_threads
 from worldpose.geometry.cameras import Camera
-from worldpose.triangulation.estimate import learn_detector, triangulate_joints
+from worldpose.triangulation.estimate import learn_detector, triangulate_frames
 from worldpose.triangulation.results import Triangulation
 from worldpose.triangulation.settings import TriangulationSettings
 
@@ -53,7 +53,7 @@ class SeenClip:
 
     Attributes:
         cameras: batch (cameras,).
-        camera_covariance: (cameras, 12, 12) as in `triangulate_joints`, or None.
+        camera_covariance: (cameras, 12, 12) as in `triangulate_frames`, or None.
         detections: detections of the tracked people, left-right swaps undone.
         settings: settings of triangulation.
         fps: [1/s].
@@ -142,7 +142,7 @@ def compare_held_out(
     for left_out in range(min(folds, count)):
         index = np.where((fold == left_out)[:, None], np.int16(-1), detections.detection_index)
         others = replace(detections, detection_index=index.astype(np.int16))
-        placed = triangulate_joints(
+        placed = triangulate_frames(
             clip.cameras, others, clip.settings, clip.camera_covariance, detector
         )
         alone = find_ray_constraints(clip.cameras, others, placed.joints)

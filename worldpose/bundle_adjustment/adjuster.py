@@ -37,7 +37,7 @@ from worldpose.bundle_adjustment.uncertainty import (
 )
 from worldpose.compiled import map_in_threads
 from worldpose.geometry.cameras import Camera
-from worldpose.triangulation.estimate import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_frames
 from worldpose.triangulation.world import move_cameras
 
 _SMALL_RIG: Final = 4
@@ -245,7 +245,7 @@ def place_people(clip: Clip, frames: Integers) -> Floats:
     """
     if not clip.given.all():
         return np.full((len(frames), *clip.joints.shape[1:]), np.nan)
-    return triangulate_joints(clip.cameras, clip.detections[frames], clip.triangulation).joints
+    return triangulate_frames(clip.cameras, clip.detections[frames], clip.triangulation).joints
 
 
 def _select_observations(observed: Observations, kept: Flags) -> Observations:

@@ -17,7 +17,7 @@ from worldpose.geometry.rows import take_rows
 from worldpose.ingest.clock import row_rate
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.report import StaticCalibration
-from worldpose.triangulation.estimate import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_frames
 from worldpose.triangulation.noise_model import conditions
 from worldpose.triangulation.settings import TriangulationSettings
 
@@ -209,7 +209,7 @@ def learn_confidence(clip: Clip, frames: Integers) -> Clip:
     """
     settings, detections = clip.triangulation, clip.detections
     if settings.learn_noise and len(frames):
-        noise = triangulate_joints(clip.cameras, detections[frames], settings).noise
+        noise = triangulate_frames(clip.cameras, detections[frames], settings).noise
         precision = noise.precision(detections.confidence, conditions(detections.keypoints))
     else:
         precision = np.where(detections.confidence > 0.0, detections.confidence, 0.0)

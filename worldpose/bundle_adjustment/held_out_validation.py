@@ -23,7 +23,7 @@ from worldpose.errors import InputError
 from worldpose.geometry.camera_model import STEP
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.optimize.losses import MEDIAN_SQUARED, cauchy_loss
-from worldpose.triangulation.estimate import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_frames
 from worldpose.triangulation.person_offsets import StatedErrors, stated_errors
 
 
@@ -88,7 +88,7 @@ def _triangulate(
     others = detections.detection_index.copy()
     if camera is not None:
         others[:, camera] = -1
-    return triangulate_joints(cameras, detections.assign_people(others), clip.triangulation).joints
+    return triangulate_frames(cameras, detections.assign_people(others), clip.triangulation).joints
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from worldpose.compiled import map_in_threads
 from worldpose.geometry.cameras import Camera, camera_arrays
 from worldpose.static_calibration.parameters import project_with_jacobian
 from worldpose.static_calibration.report import image_problems
-from worldpose.triangulation.estimate import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_frames
 
 
 def adjustment_arrays(
@@ -167,7 +167,7 @@ def _find_outliers(
 ) -> Floats:
     """Return rows (n, 5) of frame, camera, person, joint and Mahalanobis distance."""
     detections = clip.detections[frames]
-    joints = triangulate_joints(cameras, detections, clip.triangulation).joints
+    joints = triangulate_frames(cameras, detections, clip.triangulation).joints
     image, weight = detections.by_person()
     predicted, stated = project_joints(cameras, joints, weight, clip.triangulation)
     off = np.linalg.norm(predicted - image, axis=-1) / (noise.scale * stated)

@@ -11,7 +11,7 @@ from data_contracts.arrays import AnyFloats, Floats
 from data_contracts.keypoints import KeypointDetections
 from worldpose.compiled import map_in_threads
 from worldpose.geometry.cameras import Camera
-from worldpose.triangulation.estimate import triangulate_joints
+from worldpose.triangulation.estimate import triangulate_frames
 from worldpose.triangulation.settings import TriangulationSettings
 
 FARTHEST: Final = 0.2
@@ -61,7 +61,7 @@ def measure_held_out(
         total, keypoints = 0.0, 0
         index = np.where((fold == left_out)[:, None], np.int16(-1), used.detection_index)
         others = replace(used, detection_index=index.astype(np.int16))
-        placed = triangulate_joints(cameras, others, settings)
+        placed = triangulate_frames(cameras, others, settings)
         for camera in np.flatnonzero(fold == left_out):
             seen = np.asarray(detected[:, camera], dtype=np.float64)
             away = _distances(cameras[int(camera)], seen, placed.joints)

@@ -133,7 +133,7 @@ def learn_clip(
     def read_track(person: int, frames: slice) -> PersonKeypoints:
         alone = read_frames(detections, frames, late).select_person(person)
         known = detector.select_person(person)
-        raw = triangulate_joints(cameras, alone, settings, camera_covariance, known)
+        raw = triangulate_frames(cameras, alone, settings, camera_covariance, known)
         unswapped = undo_swaps(alone, raw.exchanged)
         precision = raw.noise.precision(unswapped.confidence, conditions(unswapped.keypoints))
         return select_person(unswapped, precision, raw.offsets, raw.joints, person=0)
@@ -191,7 +191,7 @@ def reconstruct_chunks(
         return read_frames(detections, chosen, model.corrected)
 
     def triangulate(some: KeypointDetections) -> Triangulation:
-        return triangulate_joints(cameras, some, settings, camera_covariance, model.detector)
+        return triangulate_frames(cameras, some, settings, camera_covariance, model.detector)
 
     triangulated = _join_halves(parts, halves, map_in_threads(triangulate, map(read, halves)))
     before, here = None, next(triangulated)
@@ -242,12 +242,30 @@ def triangulate_joints(
             clip.
 
     Raises:
-        InputError: the shapes do not match.
+        InputError: the shapes do not match, or `settings.method` is not ours.
 
     Note:
         Residuals are pixels to first order in their length: the lens is linearised at the
         observation, accurate enough for any inlier residual.
     """
+    if settings.method != "worldpose":
+        raise InputError(
+            "triangulate_joints: method",
+            expected="worldpose, whose joints the paper's method starts from",
+            found=settings.method,
+            todo="Call reconstruct_joints; its `triangulation.joints` are the paper's.",
+        )
+    return triangulate_frames(cameras, detections, settings, camera_covariance, model)
+
+
+def triangulate_frames(
+    cameras: Cameras,
+    detections: KeypointDetections,
+    settings: TriangulationSettings,
+    camera_covariance: Floats | None = None,
+    model: DetectorModel | None = None,
+) -> Triangulation:
+    """Return `triangulate_joints` by our method, whatever `settings.method` says."""
     cameras = Camera.batch(cameras)
     check_shapes(cameras, detections, camera_covariance)
     if model is None and (

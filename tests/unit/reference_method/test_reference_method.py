@@ -7,6 +7,7 @@ torch = pytest.importorskip("torch")
 
 from camera_builders import look_at_camera  # noqa: E402
 
+import worldpose as wp  # noqa: E402
 from data_contracts.conventions import COCO17_RIGID_BONES  # noqa: E402
 from worldpose.body.body_file import find_body  # noqa: E402
 from worldpose.body.differentiable import DifferentiableBody  # noqa: E402
@@ -158,6 +159,23 @@ def test_joints_about_the_mid_hip_do_not_feel_a_camera_that_shifts_the_person(ca
     np.testing.assert_allclose(found, joints, atol=2e-3)
     plain = triangulate(tensors, pixels.flatten(0, 1), start.flatten(0, 1)).reshape(1, 3, 3)
     assert np.abs(plain.numpy() - joints).max() > 0.02
+
+
+@pytest.mark.parametrize("method", ["paper", "paper_midhip"])
+def test_the_papers_method_is_computed_or_refused_but_never_ours_in_its_name(body, cameras, method):
+    joints = body.keypoints(*moving_person(body)).numpy()[:, None]
+    image = cameras.project(joints.reshape(-1, 1, 17, 3)).reshape(-1, 4, 1, 17, 2)
+    image = image + np.random.default_rng(0).normal(size=image.shape)
+    index = np.zeros(image.shape[:3], dtype=np.int16)
+    seen = wp.KeypointDetections.from_keypoints(image, np.ones(image.shape[:-1]), index)
+    papers, ours = wp.TriangulationSettings(method=method), wp.triangulate_joints(cameras, seen)
+    found = wp.reconstruct_joints(cameras, seen, 25.0, papers).triangulation.joints
+    assert 1e-6 < np.abs(found - ours.joints).max() < 0.1
+    with pytest.raises(InputError, match="Call reconstruct_joints"):
+        wp.triangulate_joints(cameras, seen, papers)
+    evidence = wp.ClipEvidence(joints, np.full((*joints.shape, 3), 1e-4) * np.eye(3), 25.0)
+    with pytest.raises(InputError, match=r"body_fitting.paper_variant.fit_in_windows"):
+        wp.fit_bodies(find_body(), evidence, wp.BodyFittingSettings(method="paper"))
 
 
 def test_shape_by_bone_lengths_is_that_of_an_exact_body_whatever_a_few_frames_say(body):
