@@ -42,7 +42,7 @@ def bundle_adjustment(inputs: UnitInputs, result: ResultWriter) -> None:
         cameras=opened.cameras,
         covariance=np.where(np.isfinite(covariance), covariance, 0.0),  # 0 = a given camera
         clicks=tuple(_clicks(inputs, camera, pitch) for camera in opened.camera_ids),
-        fps=float(inputs.sources["fps"]) / stride,
+        fps=float(inputs.sources["fps"]),
         detections=opened.detections[:].assign_people(index),
         joints=joints,
         views=views,

@@ -73,7 +73,7 @@ class Clip:
         covariance: (cameras, 12, 12) covariance of a step, in the order of `PARAMETERS`; all zero
             for a given camera.
         clicks: clicks of every camera.
-        fps: frames per second.
+        fps: frame numbers per second [1/s].
         detections: (frames, cameras, detections) detections of tracked people, with match frames.
         joints: (frames, persons, 17, 3) [m], world, as triangulated; NaN where not determined.
         views: (frames, persons, 17) inlier cameras.
@@ -114,6 +114,12 @@ class Clip:
                 found=f"{found}",
                 todo="Give arrays of the same clip and cameras.",
             )
+
+    @cached_property
+    def frame(self) -> Integers:
+        """Match frame of each row (frames,)."""
+        frame, rows = self.detections.frame, len(self.detections.detection_index)
+        return frame if len(frame) else np.arange(rows)
 
     @cached_property
     def given(self) -> Flags:
@@ -291,7 +297,7 @@ def propose_frames(
         best = int(rest[np.argmax(gain)])
         chosen.append(best)
         collected += offered[best]
-        near = np.abs(np.arange(len(left)) - best) < gap * clip.fps - 1e-9
+        near = np.abs(clip.frame - clip.frame[best]) < gap * clip.fps - 1e-9
         left[near] = False
         left[best] = False
     return np.array(sorted(chosen), dtype=np.int64)
@@ -310,4 +316,4 @@ def _count_keypoints(clip: Clip, min_views: int) -> Floats:
     offered = np.zeros((frames, cameras, int(cell_of.max(initial=0)) + 1))
     f, c, p = np.nonzero(clip.detections.detection_index >= 0)
     np.add.at(offered, (f, c, cell_of[f, p]), number[f, p])
-    return offered.reshape(frames, -1)
+    return offered.reshape(frames, cameras * offered.shape[2])

@@ -58,7 +58,7 @@ def adjust_cameras(
     proposed = propose_frames(
         clip, settings.max_frames, settings.min_frame_gap_s, settings.min_views
     )
-    used = np.flatnonzero(np.isin(clip.detections.frame, settings.chosen_frames))
+    used = np.flatnonzero(np.isin(clip.frame, settings.chosen_frames))
     used = used if settings.chosen_frames else proposed
     if settings.method == "paper":
         return adjust_unguarded(clip, settings, proposed, used)
@@ -117,9 +117,9 @@ def adjust_cameras(
             + ("" if fixed[c] else describe_motion(motion[c]))
             for c in range(count)
         ),
-        proposed=clip.detections.frame[proposed],
-        used=clip.detections.frame[used],
-        judged=clip.detections.frame[judged],
+        proposed=clip.frame[proposed],
+        used=clip.frame[used],
+        judged=clip.frame[judged],
         noise=adjuster.noise,
         verdict=first,
         evidence=evidence,

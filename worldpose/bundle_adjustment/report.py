@@ -57,7 +57,7 @@ def adjustment_arrays(
         "held_out_error": adjusted.verdict.error,
         "marking_error": np.stack(errors, axis=1),
         "weak_step": np.stack([direction.step for direction in weak]),
-        "outlier_frame": clip.detections.frame[outliers.frame],
+        "outlier_frame": clip.frame[outliers.frame],
         "outlier_camera": outliers.camera,
         "outlier_person": person[outliers.person].astype(np.int64),
         "outlier_joint": outliers.joint,
@@ -149,7 +149,7 @@ def keypoint_outliers(
     They are those beyond a Mahalanobis distance; the list has a maximum length.
     """
     block = 256  # frames at a time: limits the memory, not the result
-    last = len(clip.detections.frame)
+    last = len(clip.frame)
 
     def find(first: int) -> Floats:
         frames = np.arange(first, min(first + block, last))
@@ -335,9 +335,9 @@ def refuse_all(
         covariance=clip.covariance,
         accepted=np.zeros(count, dtype=np.bool_),
         reasons=(f"refused: {reason}",) * count,
-        proposed=clip.detections.frame[proposed],
-        used=clip.detections.frame[used],
-        judged=clip.detections.frame[judged],
+        proposed=clip.frame[proposed],
+        used=clip.frame[used],
+        judged=clip.frame[judged],
         noise=KeypointNoise(),
         verdict=Verdict(np.zeros(count, dtype=np.int64), nan, nan, np.zeros(count)),
         evidence=PooledEvidence(0.0, 0.0, 0.0),

@@ -9,7 +9,7 @@ from rigs import errors
 
 from data_contracts.cameras import LensCalibration
 from data_contracts.keypoints import KeypointDetections
-from worldpose.bundle_adjustment.clip import Clicks
+from worldpose.bundle_adjustment.clip import Clicks, propose_frames
 from worldpose.bundle_adjustment.estimate import adjust_cameras, adjust_unguarded
 from worldpose.bundle_adjustment.held_out_validation import held_out_errors
 from worldpose.bundle_adjustment.people_cameras import KnownLength, locate_cameras
@@ -195,8 +195,9 @@ def test_groups_that_show_different_people_are_named(walkers, cameras):
 QUICK = BundleAdjustmentSettings(max_frames=8, folds=2, solver=SolverSettings(min_cost_change=1e-6))
 
 
-def test_people_bring_cameras_together(clip):
-    made, true, _ = clip()
+@pytest.mark.parametrize("noise", [1.0, 0.0])
+def test_people_bring_cameras_together(clip, noise):
+    made, true, _ = clip(noise=noise)
     adjusted = adjust_cameras(made, QUICK)
     assert adjusted.accepted.all()
     # Scatter of a pixel's rotation and of decimetres becomes what 800 keypoints per camera leave;
@@ -204,6 +205,19 @@ def test_people_bring_cameras_together(clip):
     assert errors(adjusted.cameras, true).mean() < 0.4 * errors(made.cameras, true).mean()
     assert (adjusted.verdict.loss[:, 1] < adjusted.verdict.loss[:, 0]).all()
     assert all(reason.startswith("accepted") for reason in adjusted.reasons)
+
+
+def test_frames_lie_apart_by_their_numbers_or_by_their_rows_without_any(clip):
+    made, *_ = clip(frames=40)
+    fifth = replace(made.detections, frame=5 * made.detections.frame)
+    none = replace(made.detections, frame=made.detections.frame[:0])
+    chosen = [
+        propose_frames(replace(made, fps=fps, detections=seen), 8, 0.4, 3).tolist()
+        for fps, seen in ((25.0, made.detections), (125.0, fifth), (25.0, none))
+    ]
+    assert len(chosen[0]) > 3 and chosen[0] == chosen[1] == chosen[2]
+    without = replace(made, detections=none, joints=np.full_like(made.joints, np.nan))
+    assert adjust_cameras(without, QUICK).used.size == 0
 
 
 @pytest.mark.slow
@@ -248,7 +262,9 @@ def test_markings_alone_are_refused_where_they_bend_the_camera(clip):
     assert all(reason.startswith("refused: the loss of") for reason in adjusted.reasons)
 
 
-@pytest.mark.parametrize("case", ["nobody", "one camera", "two cameras in line", "no markings"])
+@pytest.mark.parametrize(
+    "case", ["nobody", "no frames", "one camera", "two cameras in line", "no markings"]
+)
 def test_what_tells_nothing_leaves_cameras_as_they_were_and_says_why(clip, case):
     if case == "one camera":
         made, *_ = clip(cameras=1)
@@ -259,6 +275,9 @@ def test_what_tells_nothing_leaves_cameras_as_they_were_and_says_why(clip, case)
     settings, reason = QUICK, "no person has enough inlier cameras"
     if case == "nobody":
         made = replace(made, joints=np.full_like(made.joints, np.nan))
+    if case == "no frames":
+        seen, joints, views = made.detections[:0], made.joints[:0], made.views[:0]
+        made = replace(made, detections=seen, joints=joints, views=views)
     if case == "no markings":
         count = len(made.clicks)
         made = replace(made, clicks=(Clicks.none(),) * count)
