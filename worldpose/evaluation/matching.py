@@ -334,7 +334,9 @@ def _pairs(predicted: Floats, true: Floats) -> tuple[Integers, Integers]:
     # Maximum pairs of people to try, by falling number of common joints: all of 20 against 20.
     max_pairs = 400
     order = np.argsort(-common, axis=None, kind="stable")[:max_pairs]
-    order = order[common.ravel()[order] >= true.shape[2]]
+    # A whole body's; where no pair has them, as many as any has, down to those of PA-MPJPE.
+    fewest = min(true.shape[2], max(7, int(common.max(initial=0))))
+    order = order[common.ravel()[order] >= fewest]
     rows, columns = np.divmod(order, predicted.shape[1])
     return rows, columns
 

@@ -244,6 +244,14 @@ def test_worlds_of_their_own_are_registered_despite_noise_and_split_tracks():
     assert scores.g_mpjpe_mm == pytest.approx(31.2, rel=0.01)
 
 
+def test_one_frame_in_a_world_of_its_own_is_registered_without_a_joint_of_every_person():
+    truth = tracks([[person(), person(3.0, 1.0), person(9.0, -4.0)]])
+    foreign = moved(truth, [0.3, 0.0, 2.0], [100.0, 50.0, -20.0], scale=0.3).joints
+    foreign[:, :, 9] = np.nan
+    scores = score(tracks(foreign), truth)
+    assert (scores.track_coverage, scores.g_mpjpe_mm) == (1.0, pytest.approx(0.0, abs=MM))
+
+
 FLAT = PitchTemplate.from_spec(PitchSpec(crown=0.0))
 CROWNED = PitchTemplate.standard()
 
