@@ -184,7 +184,14 @@ def _align_markers(
         notes.append(f"{markers.zeros} markers at exactly 0, 0, 0 count as missing")
     people = map_marker_names(markers.names) if marker_map is None else read_marker_map(marker_map)
     joints = marker_joints(markers, people)
-    return align_reference(prediction, joints, markers.rate, fps, markers.start)
+    tracks, found = align_reference(prediction, joints, markers.rate, fps, markers.start)
+    if not found.is_sure:
+        notes.append(
+            "the clock of the reference is not sure: with another offset within 2 s, joints are "
+            f"{1000.0 * found.elsewhere:.0f} mm apart. Evaluate more frames in which people move, "
+            "with clocks that differ by less than 2 s"
+        )
+    return tracks, found
 
 
 def reference_side(name: str) -> Side:

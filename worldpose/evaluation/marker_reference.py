@@ -267,6 +267,13 @@ class ReferenceAlignment:
     """Motion from the reference's world into the prediction's; its scale is 1."""
     residual: float
     """Root mean square distance of joints after the motion [m]."""
+    elsewhere: float
+    """The least of it at offsets that are 0.4 to 2 s away [m]; infinite if unknown."""
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether people moved enough, in enough frames, to tell the offset from others."""
+        return self.elsewhere > 1.5 * self.residual
 
 
 def align_reference(
@@ -304,8 +311,11 @@ def align_reference(
             f"{max_offset_s:g} s of difference between their clocks"
         )
 
-    def error(shift: float) -> float:
-        return _fit_motion(prediction.joints, sample_joints(joints, rate, times + shift), match)[1]
+    def error(shift: float, fewest: int = 0) -> float:
+        moved = sample_joints(joints, rate, times + shift)
+        if np.isfinite(moved[..., 0]).sum() < fewest:
+            return np.inf
+        return _fit_motion(prediction.joints, moved, match)[1]
 
     # Tenths of a millisecond: a millimetre of a runner's path.
     found = minimize_scalar(
@@ -316,7 +326,11 @@ def align_reference(
     placed = motion.apply(moved.reshape(-1, 3)).reshape(moved.shape)
     ids = np.arange(1, moved.shape[1] + 1)
     tracks = JointTracks(prediction.frames, ids, placed)
-    return tracks, ReferenceAlignment(float(found.x), motion, residual)
+    away = np.arange(4, 2 * count + 1) * step_s / 2
+    # A short overlap fits by chance.
+    fewest = int(np.isfinite(moved[..., 0]).sum()) // 2
+    elsewhere = min(error(found.x + shift, fewest) for shift in (*-away, *away))
+    return tracks, ReferenceAlignment(float(found.x), motion, residual, elsewhere)
 
 
 def sample_joints(joints: Floats, rate: float, times: Floats) -> Floats:

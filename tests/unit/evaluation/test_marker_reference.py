@@ -194,7 +194,12 @@ def test_time_place_and_people_are_found_again(tmp_path, markers, prediction):
     np.testing.assert_allclose(found.motion.rotation, TURN.as_matrix(), atol=1e-3)
     np.testing.assert_allclose(found.motion.translation, SHIFT, atol=2e-3)
     assert float(found.motion.scale) == 1.0
-    assert found.residual < 1e-3
+    assert found.residual < 1e-3 and found.is_sure
+    # A clock off by 4 s, beyond the search; and a moment, which any offset explains but for noise.
+    noisy = prediction.joints[:3, 1:] + np.random.default_rng(0).normal(0.0, 0.02, (3, 1, 17, 3))
+    brief = JointTracks(np.arange(10, 13), np.array([4]), noisy)
+    for mine, part in ((prediction, markers[400:]), (brief, markers[:, :1])):
+        assert not align_reference(mine, part, RATE, FPS)[1].is_sure
     scores, _ = evaluate_joints(prediction, reference)
     assert (scores.mpjpe_mm, scores.coverage) == (pytest.approx(0.0, abs=1.0), 1.0)
 
