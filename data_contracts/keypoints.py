@@ -131,6 +131,9 @@ class KeypointDetections(Generic[Array]):
         Each camera has (frames, detections). The result has every frame that a camera has; a
         camera's missing frames, detections and points are NaN.
         """
+        if not cameras:
+            none = np.empty((0, 0, 0, 17))
+            return KeypointDetections.from_keypoints(np.stack([none, none], axis=-1), none)
         points = tuple(dict.fromkeys(point for each in cameras for point in each.points))
         cameras = [each.with_points(points) for each in cameras]
         frames = [each.frame if len(each.frame) else np.arange(len(each.score)) for each in cameras]

@@ -98,6 +98,9 @@ def reconstruct(match: MatchFolder, clip_id: str | None = None) -> Reconstructio
 def calibrate_static_cameras(match: MatchFolder, pitch: PitchTemplate) -> list[StaticCalibration]:
     """Return each static camera from clicks on markings, and from painted lines in its still."""
     calibrations = []
+    if not match.spec.static_cameras:
+        todo = "Use `worldpose run`: it places people by a broadcast camera alone."
+        raise InputError(f"{match.folder / 'match.yaml'}", "static cameras", "none", todo)
     for spec in match.spec.static_cameras:
         if spec.id not in match.clicked:
             expected, todo = f"clicks of static camera {spec.id!r}", "Add them, or use a run."

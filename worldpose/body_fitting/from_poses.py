@@ -80,8 +80,7 @@ def reconstruct_bodies(
     if not isinstance(detections, KeypointDetections):
         for camera in detections:
             _require_rising(camera.frame)
-        given = list(detections)
-        detections = KeypointDetections.stack(given) if given else KeypointDetections.empty()
+        detections = KeypointDetections.stack(list(detections))
     _require_rising(detections.frame)
     if cameras.batch_shape != detections.score.shape[1:2] or len(cameras.focal) < 2:
         raise InputError(

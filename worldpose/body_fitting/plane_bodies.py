@@ -65,7 +65,7 @@ class PlaneEvidence:
     """Observations of people by one camera, static or moving, and their places on the pitch.
 
     Attributes:
-        camera: batch (frames,); NaN where unknown.
+        camera: batch (frames,), each with a pose; the focal length is NaN where unknown.
         number: (frames,), numbers of the images in the camera's video, as the estimates have them.
         keypoints: (frames, persons, 17, 2) [px], COCO-17; NaN where not seen.
         confidence: (frames, persons, 17) in (0, 1]; NaN where not seen.

@@ -52,7 +52,7 @@ class ClipEvidence:
         common_bias: (17,) per axis, error that all views share [m], whose square is part of
             `covariance`; None = none.
         ray_constraints: lines of sight of joints that are not triangulated, for the same frames and
-            persons; a person without joints is present as long as these last.
+            persons; they keep a person present from the first to the last triangulated joint.
         monocular_poses: poses of the same frames and persons, used where few joints are well
             determined.
         shared_covariance: (frames, persons, 3, 3) [m^2], the part of `covariance` that moves all
