@@ -278,9 +278,9 @@ def estimate_noise(
     scale = (
         float(np.sqrt(np.median(squared[views > 2]) / MEDIAN_SQUARED)) if (views > 2).any() else 1.0
     )
-    # Exact keypoints have at least the rounding of stored ones, of 32 bits; 0 would divide by 0.
-    rounding = np.spacing(np.abs(observed.image).max(initial=1.0), dtype=np.float32) / np.sqrt(12.0)
-    scale = max(scale, float(rounding / np.median(observed.noise)))
+    # Far below any detector's noise; the weights of exact keypoints would leave no digits for the
+    # prior, which alone holds the place of all cameras together.
+    scale = max(scale, 1e-3)
     pull = off * cauchy_weight((off**2).sum(axis=1), robust_scale * scale)[:, None]
     series = (observed.camera_of * (observed.person_of.max() + 1) + observed.person_of) * 17
     _, series = np.unique(series + observed.joint_of, return_inverse=True)
