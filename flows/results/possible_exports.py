@@ -6,9 +6,11 @@ from collections.abc import Iterator
 from importlib.util import find_spec
 from typing import Final
 
+import numpy as np
+
 from data_contracts.match import MatchSpec
 from data_contracts.release import EXPORT_FORMATS
-from flows.results.best_results import bodies_unit, find_clips, has_joints
+from flows.results.best_results import bodies_unit, find_clips, joint_tracks
 from flows.results.export import OF_CAMERAS, POSITION_FORMATS
 from flows.results.run_cameras import broadcast_views, static_cameras
 from worldpose.ingest.footage import unit_frames
@@ -30,7 +32,8 @@ def impossible_exports(run: Run, spec: MatchSpec) -> dict[str, str]:
     """Return the formats that a run cannot have, each with the reason in a sentence."""
     clips, views = find_clips(run.record), broadcast_views(run)
     has_cameras = bool(views or static_cameras(run, spec))
-    are_in_3d = any(has_joints(run, clip) for clip in clips)
+    joints = (joint_tracks(run, clip, definition="detector").joints for clip in clips)
+    are_in_3d = any(np.isfinite(each).any() for each in joints)
     have_bodies = all(bodies_unit(run, clip) in run for clip in clips)
     are_filmed = all(broadcast_views(run, clip) for clip in clips)
     have_rate = all(unit_frames(spec, view).rate == 1.0 for view in views)

@@ -71,7 +71,6 @@ def describe_clip(origin: best_results.Origin, clip: str) -> dict[str, str]:
         "software": f"worldpose {version('worldpose')}",
         "match": origin.spec.match_id,
         "run": origin.run.record.run_id,
-        "verdict": origin.run.record.usability.verdict,
         "clip": clip,
         "frames_per_second": f"{origin.spec.fps:g}",
         "world": "origin at the centre spot, x along the touch line, y across, z up, right-handed"

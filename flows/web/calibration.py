@@ -134,7 +134,8 @@ def routes(context: PageContext) -> APIRouter:
     @router.get("")
     def picture(match_id: str, owner: str, frame: int | None = None) -> dict[str, Any]:
         match, size = open_camera(match_id, owner)
-        given, seen = match.folder.calibrations.get(owner), {"pitch": None, "markings": {}}
+        given = match.folder.calibrations.get(owner)
+        seen: dict[str, Any] = {"pitch": None, "markings": {}}
         if match.folder.pitch is not None:
             drawing = open_picture(match_id, owner)[1]
             seen["pitch"] = _pitch(drawing)

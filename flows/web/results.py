@@ -34,7 +34,6 @@ from flows.results.comparison import SubjectChange, compare_runs, paired_people
 from flows.results.export import export
 from flows.results.outputs import OWNERS
 from flows.results.possible_exports import impossible_exports
-from flows.results.run_cameras import broadcast_views
 from flows.results.tool_exports import image_views
 from flows.review.identities import names_said
 from flows.stage import Match

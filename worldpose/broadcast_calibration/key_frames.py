@@ -275,9 +275,8 @@ def _calibrate_each(
 
     def tells_no_side(frame: int) -> bool:
         markings = clicked[frame].markings
-        return all(
-            turn_name(each.name) == each.name for each in (*markings.points, *markings.drawn)
-        )
+        names = [*(each.name for each in markings.points), *(each.name for each in markings.drawn)]
+        return all(turn_name(name) == name for name in names)
 
     for frame in sorted(clicked, key=tells_no_side):
         key = clicked[frame]

@@ -98,7 +98,8 @@ class RunQueue:
 
     def begin(self, run: QueuedRun, flow_run: str) -> QueuedRun | None:
         """Record that this process computes a run from now on; None if the run has ended."""
-        process = {"host": platform.node(), "pid": os.getpid(), "worker_pid": os.getppid()}
+        process: dict[str, Any] = {"host": platform.node(), "pid": os.getpid()}
+        process["worker_pid"] = os.getppid()
         return self._insist(run, "begun", flow_run=flow_run, **process)
 
     def cancel(self, run: QueuedRun, why: str) -> QueuedRun | None:
