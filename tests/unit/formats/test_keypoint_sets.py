@@ -337,9 +337,8 @@ def test_annotations_without_points_and_people_of_nan_are_nobody(tmp_path):
     path.write_text(json.dumps(content))
     found = read_coco_results(path)
     assert (found.people.score.shape, found.changes) == ((1, 1), (0, 1, 0, 1, 0))
-    assert "annotations without keypoints, such as of the ball" in str(
-        describe_changes({"a": found})
-    )
+    said = str(describe_changes({"a": found}))
+    assert "annotations without keypoints, such as of the ball" in said
     path.write_text(json.dumps(content | {"annotations": [ball, {**ball, "keypoints": []}]}))
     with pytest.raises(InputError, match="expected keypoints of people, found 2 annotations"):
         read_coco_results(path)
