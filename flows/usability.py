@@ -115,8 +115,8 @@ the keypoints of {part} depart from the people in {unit}, or its images are bad,
 time{when}. Look at the video there.
 
 triangulation missed_share max_unusable_share
-detections of {part} lack a person of {unit} whom its images should show, for {value} of the
-time{when}. Look at the people of that camera, or give better 2D poses.
+no detection of {part} is matched to a person of {unit} whom its images should show, for {value} of
+the time{when}. Look at the people of that camera, its clock and its calibration.
 
 triangulation misplacement_m max_misplacement_m
 the calibration of {part} displaces people in {unit} by {value}. Click more markings, where there

@@ -68,9 +68,14 @@ class ClockOffsets(NamedTuple):
     def verdict(self) -> str:
         """Which of the offsets that stay the people confirm, and which they do not tell."""
         stay = [row for row in self.rows if row.proposed == row.stated]
-        told = [row.camera for row in stay if row.found is not None]
+        # The offset of a reference stays whatever it is.
+        told = [row for row in stay if row.found is not None and row.camera != row.relative_to]
         untold = [row.camera for row in stay if row.found is None]
-        said = [f"The people confirm the offsets of {', '.join(told)}."] if told else []
+        said = []
+        if told and not self.has_rest:
+            names = ", ".join(row.camera for row in told)
+            to = " and ".join(dict.fromkeys(row.relative_to or "" for row in told))
+            said.append(f"The people confirm the offsets of {names}, relative to {to}.")
         if untold:
             rest = f"Nothing tells the offsets of {', '.join(untold)}: they stay, right or wrong."
             said.append(rest)

@@ -81,7 +81,9 @@ def describe_clip(origin: best_results.Origin, clip: str) -> dict[str, str]:
         "filled": "gaps interpolated on request; joints without a contributing camera are flagged"
         if origin.filled
         else "joints without a contributing camera come from the motion or the rest of the body",
-        "verdict": "; ".join((said.verdict, *said.reservations)),
+        # A text of C3D has at most 20 KB.
+        "verdict": "; ".join((said.verdict, *said.reservations[:20]))
+        + (f"; and {rest} more: see the run" if (rest := len(said.reservations) - 20) > 0 else ""),
         "licence": origin.licence or "not stated: ask the owner of the recording",
     }
     if changes := view_changes(origin.run, clip, origin.stage):

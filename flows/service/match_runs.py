@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import uuid
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
@@ -17,7 +18,7 @@ from urllib.parse import quote
 from pydantic import JsonValue
 
 from data_contracts.operations import Priority, QueuedRun
-from flows.orchestration.prefect_api import PrefectApi
+from flows.orchestration.prefect_api import PrefectApi, UnreachablePrefectError
 from flows.orchestration.prefect_environment import CLIENT_LOGIN
 from flows.service.layout import is_alive, served_state
 from flows.service.plan import TITLES, ServePlan, deployment_name
@@ -110,15 +111,16 @@ class MatchRuns(PrefectApi):
         """End a run, or take it out of the queue; return False if it has ended.
 
         The queue decides: a process that has read Prefect's state would overwrite it. The worker
-        ends the process of a run that the queue calls cancelled.
-
-        Raises:
-            UnreachablePrefectError: Prefect does not answer.
+        ends the process of a run that the queue calls cancelled, and Prefect is told later if it
+        does not answer.
         """
         ended = self.queue.cancel(run, why)
-        if ended is not None and self.find(f"/flow_runs/{ended.flow_run}") is not None:
-            self.set_state(ended.flow_run, "CANCELLED", why)
-        return ended is not None
+        if ended is None:
+            return False
+        with suppress(UnreachablePrefectError):
+            if self.find(f"/flow_runs/{ended.flow_run}") is not None:
+                self.set_state(ended.flow_run, "CANCELLED", why)
+        return True
 
     def link(self, run: QueuedRun) -> str:
         """Return the page of a run in Prefect's dashboard."""

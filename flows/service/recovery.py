@@ -109,9 +109,12 @@ def adopt_due(runs: MatchRuns) -> None:
             kind = "CRASHED" if ended.state == "failed" else "CANCELLED"
             runs.set_state(run["id"], kind, ended.message)  # else it would keep its place
             continue
-        is_retried = ended.state in ENDED and run["state_type"] == "SCHEDULED"
-        if is_retried and parse_time(run["state"]["timestamp"]) > ended.changed_at:
-            runs.queue.change(ended, "asked", "retried at Prefect")
+        if ended.state in ENDED and run["state_type"] == "SCHEDULED":
+            is_late = ended.state == "cancelled" and run["state_name"] == "Late"  # not by a person
+            if parse_time(run["state"]["timestamp"]) > ended.changed_at and not is_late:
+                runs.queue.change(ended, "asked", "retried at Prefect")
+            elif ended.state == "cancelled":  # while Prefect did not answer
+                runs.set_state(run["id"], "CANCELLED", ended.message)
 
 
 def _recover(

@@ -39,7 +39,9 @@ def main(flow: str, run_id: UUID) -> None:
             queue = queue_of_parameters(at_prefect.parameters)
             run = queue.take(queued_run(flow, at_prefect.model_dump(mode="json")))
             states = client.read_flow_run_states(run_id) if run.state in ENDED else []
-        if any(each.is_scheduled() and each.timestamp > run.changed_at for each in states):
+        # "Late" is said by Prefect itself.
+        asked = (each for each in states if each.is_scheduled() and each.name != "Late")
+        if any(each.timestamp > run.changed_at for each in asked):
             queue.change(run, "asked", "retried at Prefect")
         begun = None if _is_off(at_prefect) else queue.begin(run, str(run_id))
         if begun is None:  # it was cancelled after the worker took it

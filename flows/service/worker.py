@@ -158,11 +158,13 @@ class ServedWorker(BaseWorker[_OwnJob, BaseVariables, BaseWorkerResult]):
                 LOG.debug("run %r: %s", flow_run.name, error)
             run = await to_thread.run_sync(queue.latest, first)
             is_open = run.number == first.number or (run.state, run.pid) == ("begun", process.pid)
-            if kind == StateType.CANCELLING or run.state == "cancelled":
+            # One that was cancelled before it was taken is retried, or ends itself.
+            is_cancelled = run.state == "cancelled" and (code is not None or not is_open)
+            if kind == StateType.CANCELLING or is_cancelled:
                 if code is None:
                     await _end(process)
                 with suppress(Exception):  # without a server, the queue alone knows it
-                    cancelled: State[Any] = Cancelled(message=run.message or why)
+                    cancelled: State[Any] = Cancelled(message=run.message if is_cancelled else why)
                     await self.client.set_flow_run_state(flow_run.id, cancelled, force=True)
                 code, kind = 0, StateType.CANCELLED
             if code is not None and is_open:

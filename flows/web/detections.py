@@ -248,9 +248,10 @@ def _name_people(
         clip = tuple(each.id for each in match.folder.spec.clips_with(frame))
         if clip not in clips:
             clips[clip] = _find_tracks(store, match, owner, frame)
-        found, names[frame, detection] = clips[clip], f"detection {detection}, in no track"
+        found, names[frame, detection] = clips[clip], f"detection {detection}"
         if found is None or frame not in found.frame:
             continue
+        names[frame, detection] += ", in no track"
         here = found.detection_index[np.searchsorted(found.frame, frame)]
         for person in found.person[here[found.cameras.index(owner)] == detection].tolist():
             name = found.names.get(person, f"person {person}")

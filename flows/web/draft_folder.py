@@ -183,15 +183,16 @@ def build(
 
 def _doubt_detector(store: Store, match: MatchFolder) -> list[str]:
     """Return a warning if the bundled nets, made for a pitch, would detect the people of a lab."""
-    given = match.detections.keys() >= match.videos.keys()
-    if match.spec.pitch != NO_PITCH or given:
+    lacking = match.videos.keys() - match.detections.keys() - match.boxes.keys()
+    if match.spec.pitch != NO_PITCH or not lacking:
         return []
     if "detection.detector" in resolve(read_layers(store, match.spec)).differences():
         return []
     return [
-        "warning: no 2D poses are given, so the run detects people in the videos. The bundled nets "
-        "know people of 28 to 160 px, and miss taller ones. Add 2D poses of another tool, or state "
-        "detection.detector and detection.pose in the settings."
+        f"warning: no 2D poses of {', '.join(sorted(lacking))} are given, so the run detects "
+        "people in the videos. The bundled nets know people of 28 to 160 px, and miss taller ones. "
+        "Add 2D poses of another tool, or state detection.detector and detection.pose in the "
+        "settings."
     ]
 
 

@@ -91,15 +91,15 @@ def routes(context: PageContext) -> APIRouter:
         if before.revision != given.revision:
             raise HTTPException(409, "another person changed these settings: load the page again")
         changed = {n: it for n, it in given.values.items() if it != before.values.get(n)}
-        for key in filter(lambda key: _names_file(key, changed[key]), changed):
-            raise InputError(
-                f"{before.file}: {key}",
-                expected="a value that names no file: pages cannot choose files of the server",
-                found=repr(changed[key]),
-                todo=f"On the server: worldpose settings --set {key}=...",
-            )
         layers = layers_of(match)
         try:
+            for key in filter(lambda key: _names_file(key, changed[key]), changed):
+                raise InputError(
+                    f"{before.file}: {key}",
+                    expected="a value that names no file: pages cannot choose files of the server",
+                    found=repr(changed[key]),
+                    todo=f"On the server: worldpose settings --set {key}=...",
+                )
             save_layer(store, layers, given.layer, given.values)
         except InputError as error:
             raise _on_page(error, (before, *layers)) from error

@@ -61,7 +61,8 @@ def test_an_offset_is_found_drawn_and_written(server, shifted, tmp_path):
     cameras = yaml.safe_load((shifted / "match.yaml").read_text())["cameras"]
     assert [camera.get("offset_frames", 0) for camera in cameras] == [0] * len(cameras)
     again = succeed("synchronize", shifted, *options[:2]).out
-    assert f"The people confirm the offsets of {', '.join(rows)}.\n" in again
+    first, *others = rows
+    assert f"The people confirm the offsets of {', '.join(others)}, relative to {first}.\n" in again
     assert "--apply" not in again
 
 
@@ -79,11 +80,12 @@ def test_the_table_of_offsets_names_the_reference_and_the_unit(monkeypatch):
 
 
 def test_an_offset_that_nothing_tells_is_not_called_right(capsys):
-    rows = [Proposal("left", 4, 4.0, 0.5, 4, "", "left"), Proposal("right", 0, None, None, 0, "?")]
+    rows = [Proposal(name, 4, 4.0, 0.5, 4, "", "left") for name in ("mid", "left")]
+    rows.append(Proposal("right", 0, None, None, 0, "?"))
     for shown, told in ((rows, True), (rows[1:], False)):
         _print_offsets(ClockOffsets("clip", ["left", "right"], None, shown), None, applied=False)
         said = capsys.readouterr().out
-        assert ("The people confirm the offsets of left." in said) == told
+        assert ("The people confirm the offsets of mid, relative to left." in said) == told
         assert "Nothing tells the offsets of right: they stay, right or wrong." in said
         assert "no change" not in said
 

@@ -313,7 +313,7 @@ def test_files_of_other_tools_become_calibration_clicks_and_poses(place, footage
     store = Store.open(str(place / "project"))
     lab = replace(match, spec=match.spec.model_copy(update={"pitch": "none"}))
     (said,) = _doubt_detector(store, lab)
-    assert "28 to 160 px" in said and said.startswith("warning: no 2D poses are given")
+    assert "28 to 160 px" in said and said.startswith("warning: no 2D poses of ")
     assert _doubt_detector(store, match) == []
     write_layer(store, "project", {"detection.detector": "onnx:/x.onnx"})
     assert _doubt_detector(store, lab) == []

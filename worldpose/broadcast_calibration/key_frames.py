@@ -41,7 +41,7 @@ from worldpose.static_calibration.sides import (
     MIN_EVIDENCE,
     SeenPeople,
     compare_sides,
-    turn_name,
+    tells_side,
 )
 from worldpose.tracking.plane.feet import locate_feet
 
@@ -276,7 +276,7 @@ def _calibrate_each(
     def tells_no_side(frame: int) -> bool:
         markings = clicked[frame].markings
         names = [*(each.name for each in markings.points), *(each.name for each in markings.drawn)]
-        return all(turn_name(name) == name for name in names)
+        return not any(map(tells_side, names))
 
     for frame in sorted(clicked, key=tells_no_side):
         key = clicked[frame]

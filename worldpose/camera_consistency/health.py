@@ -103,7 +103,11 @@ class CameraHealth:
             own = 0.0 if variance is None else variance[frame, c, person][:, None]
             terms = _departures(cameras[c], pixels, joints[rows[frame], person][:, LIMBS], own)
             np.add.at(self.sums[:, c], bins[frame], terms)
-            frame, person = np.nonzero(slot < 0)
+            # Before its first and after its last detection, a camera may film nothing.
+            seen = np.flatnonzero(np.isfinite(people.score[rows, c]).any(axis=1))
+            films = np.zeros((len(rows), 1), np.bool_)
+            films[seen.min(initial=len(rows)) : seen.max(initial=-1) + 1] = True
+            frame, person = np.nonzero((slot < 0) & films)
             shown = _are_shown(cameras[c], joints[rows[frame], person][:, LIMBS])
             np.add.at(self.missed[c], person[shown], 1.0)
 

@@ -273,7 +273,7 @@ class ReferenceAlignment:
     @property
     def is_sure(self) -> bool:
         """Whether people moved enough, in enough frames, to tell the offset from others."""
-        return self.elsewhere > 1.5 * self.residual
+        return bool(np.isfinite(self.elsewhere)) and self.elsewhere > 1.5 * self.residual
 
 
 def align_reference(

@@ -31,7 +31,7 @@ from worldpose.static_calibration.lens_choice import choose_lens, widen_by_lense
 from worldpose.static_calibration.line_refinement import refine_and_judge
 from worldpose.static_calibration.report import StaticCalibration, build_report
 from worldpose.static_calibration.settings import StaticCalibrationSettings
-from worldpose.static_calibration.sides import turn_camera, turn_name
+from worldpose.static_calibration.sides import tells_side, turn_camera, turn_name
 
 
 def calibrate_camera(
@@ -125,14 +125,17 @@ def _tells_side(found: Explanation) -> bool:
     """Return whether names of inliers are those of other markings after half a turn."""
     evidence, fit = found.problem.evidence, found.fit
     names = (*compress(evidence.points, fit.inliers), *compress(evidence.markings, fit.markings))
-    return any(turn_name(name) != name for name in names)
+    return any(map(tells_side, names))
 
 
 def _choose_side(found: Explanation, pitch: PitchTemplate, place: Floats | None) -> Camera:
     """Return the camera, or itself after half a turn, on the side of a place (3,) [m]."""
     camera = found.estimate.camera
-    if place is not None and (along := float(camera.center[:2] @ place[:2])) != 0.0:
-        return turn_camera(camera) if along < 0.0 else camera
+    if place is not None:
+        here = camera.center[:2]
+        near, far = (float(np.linalg.norm(way * here - place[:2])) for way in (1.0, -1.0))
+        if abs(near - far) > 0.25 * np.linalg.norm(here):  # else it lies between the two
+            return turn_camera(camera) if far < near else camera
     names = [name for name in pitch.points if turn_name(name) != name]
     names.sort(key=lambda name: float(np.linalg.norm(pitch.points[name])))
     raise InputError(

@@ -98,6 +98,11 @@ def turn_name(name: str) -> str:
     return "_".join(other.get(word, word) for word in name.split("_"))
 
 
+def tells_side(name: str) -> bool:
+    """Return whether a point or marking is another one after half a turn, or has an own name."""
+    return turn_name(name) != name or name not in ("center_mark", "center_circle", "halfway_line")
+
+
 def decide_sides(
     seen: Mapping[str, SeenPeople], stated: Collection[str], pitch: PitchTemplate, seconds: Floats
 ) -> dict[str, SideDecision]:

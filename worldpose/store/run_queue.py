@@ -114,10 +114,14 @@ class RunQueue:
         **more: Any,  # noqa: ANN401
     ) -> QueuedRun | None:
         """Record a state, after those of other processes, of a run that has not ended."""
-        after = None
-        while after is None and (run := self.latest(run)).state not in ENDED:
-            after = self.change(run, state, why or run.message, **more)
-        return after
+        number = -1
+        while (run := self.latest(run)).state not in ENDED:
+            if run.number == number:  # its next state is there, and cannot be read
+                raise RuntimeError(f"the state after {number} of the run {run.id} is damaged")
+            if after := self.change(run, state, why or run.message, **more):
+                return after
+            number = run.number
+        return None
 
     def kill(
         self, run: QueuedRun, why: str, *, by_service: bool = False, stalled: str = ""

@@ -95,7 +95,7 @@ def add_slow_drifts(
     """
     # Least difference of the ends in standard deviations [1], and in frames; their length [s].
     min_score, min_frames, end_s = 5.0, 0.25, 30.0
-    frames = len(detections.frame)
+    frames = detections.score.shape[0]
     span = min(frames // 2, round(end_s * fps))
     if span < 2:
         return list(courses)

@@ -83,7 +83,7 @@ _TORSO = [COCO17.index(f"{side}_{at}") for side in ("left", "right") for at in (
 def _middles(detections: KeypointDetections[ClipArray]) -> Floats:
     """Return the middles of torsos (frames, cameras, detections, 2) [px], read in blocks."""
     block, parts = 256, []
-    for start in range(0, len(detections.frame), block):
+    for start in range(0, detections.score.shape[0], block):
         seen = detections[start : start + block]
         middle = np.asarray(seen.keypoints[:, :, :, _TORSO], dtype=np.float64)
         middle[~(seen.confidence[:, :, :, _TORSO] > 0.0)] = np.nan
