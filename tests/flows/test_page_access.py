@@ -32,7 +32,7 @@ def every_route(app):
     """Method and path of every route of the server, from the server itself."""
     names = {"match_id": TINY, "owner": "cam00", "request": "r", "number": "0", "clip": "clip"}
     names |= {"form": "joints", "draft": "0123456789abcdef", "file": "f", "group": "g"}
-    names |= {"before": "0001", "after": "0002", "name": "n", "kind": "css"}
+    names |= {"before": "0001", "after": "0002", "name": "n", "kind": "css", "camera": "cam00"}
     for path, methods in app.openapi()["paths"].items():
         for method in methods:
             yield method.upper(), path.format_map(names)

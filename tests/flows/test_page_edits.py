@@ -160,6 +160,10 @@ def test_a_camera_of_a_match_without_a_pitch_says_where_it_stands(
     )
     write_calibration_toml(folder / "calibration.toml", {"a": given})
     write_still(folder / "stills" / "a.png", np.full((48, 64, 3), 90, np.uint8))
+    (folder / "detections").mkdir()
+    for name in "ab":
+        person = [{"image_id": 0, "keypoints": [30.0, 20.0, 0.9] * 17}]
+        (folder / "detections" / f"{name}.json").write_text(json.dumps(person))
     register(unrun_store, folder, unfinished=True)
     path = "/api/matches/lab/pictures"
     seen = ada_before_runs.get(f"{path}/a").json()

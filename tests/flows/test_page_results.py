@@ -159,7 +159,7 @@ def test_an_open_page_gets_the_run_that_it_shows_until_it_shows_the_next(ada, pr
     assert answers("run_id=0001") == before
     store = Store.open(str(project_copy))
     spec = store.registration(TINY).spec.model_copy(update={"pitch": "none"})
-    lacking = impossible_exports(open_run(store, TINY, "0002"), spec)
+    lacking = impossible_exports(open_run(project_copy, TINY, "0002"), spec)
     assert lacking["minimap"] == "The match has no pitch."
     bodies = {lacking[form] for form in {*OF_BODIES} - {*OF_BROADCAST}}
     assert bodies == {"The run has no fitted bodies yet."}

@@ -162,7 +162,7 @@ def test_a_file_is_read_as_spreadsheets_save_it(tmp_path, encoding, separator):
     ("content", "words"),
     [
         (b"name;x;y\ncenter_mark;1,5;1.234\n", "a point and numbers with a comma"),
-        (b"PK\x03\x04 name", "a workbook, not text"),
+        (b"PK\x03\x04 name", "a damaged or locked archive"),
         (b"name,x [mm],y\ncenter_mark,1,2\n", "row 1"),
     ],
 )
