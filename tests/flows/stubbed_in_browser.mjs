@@ -21,7 +21,7 @@ async function at_server(place, answer) {
       const file = pathname === "/" ? "/index.html" : pathname;
       return route.fulfill({ body: readFileSync(task.static + file), contentType: KINDS[file.split(".").pop()] });
     }
-    const given = (await answer(pathname, search, route.request().postDataJSON(), route.request().headers())) ?? (pathname.includes("/detections/") ? [404, {}] : {});
+    const given = (await answer(pathname, search, route.request().postDataJSON(), route.request().headers())) ?? (pathname.includes("/views/") ? { people: [] } : pathname.includes("/detections/") ? [404, {}] : {});
     const [status, content] = Array.isArray(given) && typeof given[0] === "number" ? given : [200, given];
     return route.fulfill({ status, contentType: "application/json", body: JSON.stringify(content) }).catch(() => {});
   });
@@ -65,6 +65,7 @@ async function showNewRun() {
     if (path.endsWith("/metrics")) return { metrics: [{ kind: "camera", name: "north", values: { "x clicks_wrong": Number(run) } }], names: {}, before: null, problem: "", changes: [], unchanged: 0 };
     if (path.endsWith("/offsets")) return body ? {} : { clip: "half", cameras: [], changed: { south: Number(run) }, verdict: `told of ${run}`, warning: "" };
     if (path.endsWith("/runs")) return [];
+    if (path === "/api/inbox") return { inbox: null, arrivals: [] };
     if (path.endsWith("/corrections")) {
       const { edit } = body.edits[0];
       if (edit.kind === "merged_tracks") merged.push(edit.kept, edit.merged);
@@ -99,7 +100,7 @@ async function showNewRun() {
   broken = ["usd", "c3d"];
   for (const form of broken) await page.click(`[data-downloads] a >> text=${form}`);
   await page.locator("[role=alert] >> text=c3d: no disk").waitFor();
-  seen.alerts = [await page.locator("[role=alert]").count()];
+  seen.alerts = [await page.locator("[role=alert] >> text=no disk").count()];
   await page.setViewportSize({ width: 390, height: 800 });
   seen.covered = (await page.locator(".messages").boundingBox()).height;
   await page.setViewportSize({ width: 1440, height: 900 });
@@ -155,7 +156,7 @@ const held = async (key, count) => {
 
 // A question whose evidence comes at the second request, with a long curve, and whose video cannot be drawn; held keys.
 async function ask() {
-  await at_server("match/final", (path) => ({ "/api/session": session, "/api/matches/final": matchOf("0001", [question(1)]) })[path]);
+  await at_server("match/final", (path) => ({ "/api/session": session, "/api/matches/final": matchOf("0001", [question(1)]), "/api/matches/final/results": { ...resultsOf("0001"), clips: [] } })[path] ?? (path.endsWith("/evidence") ? { pictures: [], curves: [], tables: [] } : undefined));
   await page.waitForSelector("article.open");
   await wait(0.5);
   seen.scrolled = [await page.evaluate(() => [scrollY, document.querySelector("main").scrollTop])];

@@ -57,7 +57,7 @@ def test_a_healthy_run_is_usable_and_adjusted_cameras_replace_those_before():
         (
             "retriangulation/clip",
             MISSED,
-            r"of cam1 lack .* 73 % \(limit 50 %\) .* person 1 in cam1\.",
+            r"of cam1 is matched to a person .* 73 % \(limit 50 %\) .* person 1 in cam1\.",
         ),
         ("retriangulation/clip", MISPLACED, r"cam4 displaces people in clip by 8 cm \(limit 5"),
         ("retriangulation/clip", {"filled_share": 0.1}, r"no camera sees 10 % \(limit 5 %\)"),

@@ -94,7 +94,8 @@ def test_a_run_that_was_cancelled_stays_so_whatever_its_process_does(queue, monk
     assert (last.state, last.message, queue.open_runs()) == ("cancelled", "by Ada", [])
     assert told == [(last.flow_run, "CANCELLED", "by Ada")]
     assert ("run" in done) is (step in ("begin", "run"))
-    again = SimpleNamespace(is_scheduled=lambda: True, timestamp=datetime.now(UTC))
+    now = datetime.now(UTC)
+    again = SimpleNamespace(name="Scheduled", is_scheduled=lambda: True, timestamp=now)
     client.read_flow_run_states = lambda run_id: [again]  # a person retries it at Prefect
     run_process.main("match", UUID(int=1))
     assert queue.latest(run).state == "complete"

@@ -104,7 +104,7 @@ class CameraHealth:
             terms = _departures(cameras[c], pixels, joints[rows[frame], person][:, LIMBS], own)
             np.add.at(self.sums[:, c], bins[frame], terms)
             # Before its first and after its last detection, a camera may film nothing.
-            seen = np.flatnonzero(np.isfinite(people.score[rows, c]).any(axis=1))
+            seen = np.flatnonzero((people.confidence[rows, c] > 0.0).any(axis=(1, 2)))
             films = np.zeros((len(rows), 1), np.bool_)
             films[seen.min(initial=len(rows)) : seen.max(initial=-1) + 1] = True
             frame, person = np.nonzero((slot < 0) & films)
