@@ -100,7 +100,7 @@ async function showNewRun() {
   broken = ["usd", "c3d"];
   for (const form of broken) await page.click(`[data-downloads] a >> text=${form}`);
   await page.locator("[role=alert] >> text=c3d: no disk").waitFor();
-  seen.alerts = [await page.locator("[role=alert] >> text=no disk").count()];
+  seen.alerts = [await page.locator(".messages [role=alert]").count()];
   await page.setViewportSize({ width: 390, height: 800 });
   seen.covered = (await page.locator(".messages").boundingBox()).height;
   await page.setViewportSize({ width: 1440, height: 900 });

@@ -160,6 +160,7 @@ def test_runs_and_names_outlast_the_next_version(project_copy, tiny):
     view = save(ada, view, content).json()
     assert view["is_ready"], view["problems"]
     (said,) = (note for note in view["notes"] if note.startswith("The next run begins"))
+    assert "begins with: find cameras that contradict the others. It computes" in said
     assert ", and keeps " in said and len(said) < 160
     truth = f"reference/cameras/{camera}.npz"
     assert f"{truth} is left out: there is no such camera" in view["notes"]
