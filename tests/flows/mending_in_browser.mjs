@@ -44,7 +44,7 @@ await page.locator("[data-scene=ready]").waitFor();
 await page.click("[data-edit]");
 const keypoint = page.locator(`[data-keypoint="${detection}.${joint}"]`);
 await keypoint.waitFor();
-await page.locator("aside > table tr", { has: page.locator(`td:first-child:text-is("${detection}")`) }).click();
+await page.locator("aside > table tbody tr").nth(detection).click();
 const at = await keypoint.boundingBox();
 await page.mouse.click(at.x + at.width / 2, at.y + at.height / 2);
 await page.waitForSelector("[data-error-here]");

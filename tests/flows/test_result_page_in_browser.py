@@ -28,5 +28,5 @@ def test_people_are_seen_in_3d_and_played(project_copy, tmp_path):
     assert is_person.sum() > 30
     assert {name: value for name, value in seen.items() if "overflow" in name and value} == {}
     assert (seen["reports"], seen["cameras"]) == ([[5, 120], [5, 120]], 6)
-    assert seen["refused"].startswith("usd: needs the extra usd")
+    assert seen["refused"].startswith("bvh: needs the extra usd")
     assert (seen["pages"], seen["held"]) == (1, "true")
