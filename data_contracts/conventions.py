@@ -76,10 +76,7 @@ COCO17_HIPS = COCO17_TORSO[2:]
 COCO17_FLIP = (0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15)
 """The joint that each joint becomes in the mirror image."""
 
-JOINT_GROUPS = {
-    "head": ("nose", "eye", "ear"),
-    **{name: (name,) for name in _PAIRED[2:]},
-}
+JOINT_GROUPS = {"head": ("nose", "eye", "ear"), **{name: (name,) for name in _PAIRED[2:]}}
 """Parts of the names in `COCO17`, by group of joints."""
 
 FEET = (

@@ -17,10 +17,7 @@ from flows.service.alerts import Alert, AlertDispatcher
 from flows.service.layout import StateFolder
 from flows.service.metrics import ProjectMetrics, exposition, metrics_app
 from flows.service.plan import ServePlan
-from flows.service.status_page import (
-    StatusRow,
-    status_html,
-)
+from flows.service.status_page import StatusRow, status_html
 from flows.web.access import access_for
 from flows.web.app import create_app
 from worldpose.store.store import Store

@@ -279,8 +279,7 @@ def test_a_search_has_the_turn_and_the_scores_of_detection(monkeypatch, given, t
     monkeypatch.setattr(filtering, "load_pose", lambda _: SimpleNamespace(estimate=estimate))
     monkeypatch.setattr(filtering, "load_score_map", lambda _: ScoreMap(1.0, 1.0))
     inputs = SimpleNamespace(
-        unit="cam.clip",
-        manifest=lambda _: SimpleNamespace(figures={"turned_deg": turned_deg}),
+        unit="cam.clip", manifest=lambda _: SimpleNamespace(figures={"turned_deg": turned_deg})
     )
     case = SimpleNamespace(
         camera=look_at_camera((0.0, -20.0, 5.0), (0.0, 0.0, 0.0), 50.0, (40, 60)),

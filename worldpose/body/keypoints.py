@@ -129,11 +129,7 @@ BODY25: Final = (
 )
 """OpenPose's 25 points in its order."""
 
-HALPE26: Final = (
-    *COCO17,
-    *("head_top", "neck", "mid_hip"),
-    *_both("big_toe", "small_toe", "heel"),
-)
+HALPE26: Final = (*COCO17, *("head_top", "neck", "mid_hip"), *_both("big_toe", "small_toe", "heel"))
 """The 26 points of Halpe Full-Body in its order."""
 
 CHALLENGE15: Final = (

@@ -15,12 +15,7 @@ from data_contracts.arrays import Floats
 from worldpose.geometry.rows import join_rows, take_rows
 from worldpose.triangulation.clocks import CameraClocks
 from worldpose.triangulation.noise_model import NoiseModel
-from worldpose.triangulation.report import (
-    Agreement,
-    Changes,
-    SmoothingReport,
-    TriangulationReport,
-)
+from worldpose.triangulation.report import Agreement, Changes, SmoothingReport, TriangulationReport
 
 FRAME_ARRAYS = (
     "joints",
