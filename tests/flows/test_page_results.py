@@ -8,14 +8,12 @@ from importlib.util import find_spec
 import numpy as np
 import page_client
 import pytest
-from command_line import TINY, worldpose
+from command_line import TINY, invoke, worldpose
 from page_client import MATCH
-from typer.testing import CliRunner
 
 from data_contracts.release import EXPORT_FORMATS
 from data_contracts.review import SplitTrack
 from data_contracts.run import UnitFailure, WaitingUnit
-from flows.cli.app import app
 from flows.registering import open_match
 from flows.reports.cameras import camera_table
 from flows.results.best_results import fitted_bodies
@@ -94,22 +92,22 @@ def test_the_page_gets_the_bodies_of_the_store(reader, tiny_run):
 
 def test_a_command_writes_one_file(tiny_run, tmp_path):
     out = tmp_path / "view.html"
-    command = ["export", TINY, "--format", "viewer", "--project", str(tiny_run), "--out"]
-    done = CliRunner().invoke(app, [*command, str(out)])
+    command = ["export", TINY, "--format", "viewer", "--project", tiny_run, "--out", out]
+    done = invoke(*command)
     assert done.exit_code == 0, done.output
     assert f"{out.stat().st_size / 1e6:.1f} MB" in done.output.replace("\n", "")
     assert len(read_viewer(out)) == 1
-    refused = CliRunner().invoke(app, [*command, str(out), "--video"])
+    refused = invoke(*command, "--video")
     assert "--video: expected a camera with a video" in str(refused.exception)
-    refused = CliRunner().invoke(app, [*command, str(out), "--format", "joints"])
+    refused = invoke(*command, "--format", "joints")
     assert "expected a folder" in str(refused.exception)
     # Options are checked before the project is opened.
-    other = ["export", TINY, "--format", "joints", "--video", "--project", str(tmp_path)]
+    other = ["export", TINY, "--format", "joints", "--video", "--project", tmp_path]
     for command, said in (
-        ([*other, "--out", str(tmp_path)], "--video: expected --format viewer"),
-        (["unpin", "v1", "--project", str(tmp_path)], "unpin v1: expected MATCH/NAME"),
+        ([*other, "--out", tmp_path], "--video: expected --format viewer"),
+        (["unpin", "v1", "--project", tmp_path], "unpin v1: expected MATCH/NAME"),
     ):
-        assert said in str(CliRunner().invoke(app, command).exception)
+        assert said in str(invoke(*command).exception)
 
 
 def add_run(project, state, stages):
@@ -206,21 +204,21 @@ def test_results_are_there_while_the_folder_of_the_match_is_away(ada, store, tin
         paths, 200
     )
     out = tmp_path / "report.html"
-    given = ["report", TINY, "--out", str(out), "--no-videos", "--project", store.url]
-    done = CliRunner().invoke(app, given)
+    given = ["report", TINY, "--out", out, "--no-videos", "--project", store.url]
+    done = invoke(*given)
     assert (done.exit_code, "the report has no images" in done.stderr) == (0, True), done.output
     assert out.stat().st_size > 100_000
-    done = CliRunner().invoke(app, [*given, "--out", str(tmp_path)])
+    done = invoke(*given, "--out", tmp_path)
     assert "expected a file, found a folder" in str(done.exception)
     # It has images although a camera's clicks are gone; a damaged file is named.
     folder = shutil.copytree(tiny, tmp_path / "copy")
     (folder / "annotations" / "static_calibration" / "cam00.json").unlink()
-    done = CliRunner().invoke(app, ["report", str(folder), *given[2:]])
+    done = invoke("report", folder, *given[2:])
     assert (done.exit_code, "no images" in done.stderr) == (0, False), done.exception
     spec = folder / "match.yaml"
     spec.write_text(spec.read_text().replace(TINY, "other"))
     (folder / "detections" / "cam00.npz").write_bytes(b"PK")
-    done = CliRunner().invoke(app, ["report", str(folder), *given[2:]])
+    done = invoke("report", folder, *given[2:])
     assert "cam00.npz" in str(done.exception)
 
 
