@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 from command_line import TINY, invoke, succeed
-from test_refitting import halves
+from test_iteration import halves
 
 from data_contracts.review import DeletedDetection, MergedTracks, MovedPoint
 from data_contracts.run import UnitFailure
