@@ -81,16 +81,8 @@ CLICKS = "--clicks LAB/{} --camera a --out LAB/match"
 FORMS = {
     **dict.fromkeys(
         [
-            "bad.toml",
-            "bad.qca.txt",
-            "bad.xml",
-            "bad.json",
-            "bad.yml",
-            "bad.xcp",
-            "bad.mcal",
-            "bad.calib",
-            "bad.pickle",
-            "intri.yml",
+            *("bad.toml", "bad.qca.txt", "bad.xml", "bad.json", "bad.yml"),
+            *("bad.xcp", "bad.mcal", "bad.calib", "bad.pickle", "intri.yml"),
         ],
         f"--calibration LAB/{{}} {POSES}",
     ),

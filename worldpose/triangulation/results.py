@@ -18,16 +18,8 @@ from worldpose.triangulation.noise_model import NoiseModel
 from worldpose.triangulation.report import Agreement, Changes, SmoothingReport, TriangulationReport
 
 FRAME_ARRAYS = (
-    "joints",
-    "covariance",
-    "views",
-    "spread",
-    "reprojection_error",
-    "inliers",
-    "exchanged",
-    "offsets",
-    "lasting_covariance",
-    "bias_variance",
+    *("joints", "covariance", "views", "spread", "reprojection_error", "inliers"),
+    *("exchanged", "offsets", "lasting_covariance", "bias_variance"),
 )
 """Attributes of `Triangulation` with a dimension of frames."""
 
