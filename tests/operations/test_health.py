@@ -5,7 +5,6 @@ import os
 import re
 import shutil
 import socket
-import warnings
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,6 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 from command_line import TINY, worldpose
+from page_client import TestClient
 from prometheus_client.parser import text_string_to_metric_families
 from service import free_ports
 
@@ -185,10 +185,6 @@ def test_no_lock_is_made_where_no_disk_is_mounted(state, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # of the web framework, about its own test client
-    from fastapi.testclient import TestClient
-
 INFRA = Path(__file__).parents[2] / "infra"
 DASHBOARD = INFRA / "grafana" / "worldpose.json"
 
@@ -307,10 +303,6 @@ def test_a_project_in_object_storage_is_told_of_the_disk_of_its_state(bucket, tm
         shutil.disk_usage(tmp_path).free, rel=0.05
     )
 
-
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # of the web framework, about its own test client
-    from fastapi.testclient import TestClient
 
 TOKEN = "a token of twenty-four.."
 OWN = '<script defer src="/status/page.js"></script>'
