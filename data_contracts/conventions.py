@@ -25,39 +25,15 @@ COCO17 = ("nose", *(f"{side}_{joint}" for joint in _PAIRED for side in ("left", 
 """Joint order of every `keypoints` and `joints` array."""
 
 COCO17_BONES = (
-    (5, 7),
-    (7, 9),
-    (6, 8),
-    (8, 10),
-    (5, 6),
-    (11, 12),
-    (5, 11),
-    (6, 12),
-    (11, 13),
-    (13, 15),
-    (12, 14),
-    (14, 16),
-    (0, 1),
-    (0, 2),
-    (1, 3),
-    (2, 4),
-    (0, 5),
-    (0, 6),
+    *((5, 7), (7, 9), (6, 8), (8, 10), (5, 6), (11, 12), (5, 11), (6, 12)),
+    *((11, 13), (13, 15), (12, 14), (14, 16)),
+    *((0, 1), (0, 2), (1, 3), (2, 4), (0, 5), (0, 6)),
 )
 """Pairs of indices into `COCO17` that are drawn as bones."""
 
 COCO17_BODY_BONES = (
-    (5, 6),
-    (5, 7),
-    (6, 8),
-    (7, 9),
-    (8, 10),
-    (5, 11),
-    (6, 12),
-    (11, 13),
-    (12, 14),
-    (13, 15),
-    (14, 16),
+    *((5, 6), (5, 7), (6, 8), (7, 9), (8, 10)),
+    *((5, 11), (6, 12), (11, 13), (12, 14), (13, 15), (14, 16)),
 )
 """Bones below the neck whose lengths measure a person's size."""
 
@@ -76,19 +52,12 @@ COCO17_HIPS = COCO17_TORSO[2:]
 COCO17_FLIP = (0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15)
 """The joint that each joint becomes in the mirror image."""
 
-JOINT_GROUPS = {
-    "head": ("nose", "eye", "ear"),
-    **{name: (name,) for name in _PAIRED[2:]},
-}
+JOINT_GROUPS = {"head": ("nose", "eye", "ear"), **{name: (name,) for name in _PAIRED[2:]}}
 """Parts of the names in `COCO17`, by group of joints."""
 
 FEET = (
-    "left_big_toe",
-    "left_small_toe",
-    "left_heel",
-    "right_big_toe",
-    "right_small_toe",
-    "right_heel",
+    *("left_big_toe", "left_small_toe", "left_heel"),
+    *("right_big_toe", "right_small_toe", "right_heel"),
 )
 """Points of the feet, in the order of COCO-WholeBody: tips of the big toes, outer ends of the small
 toes, backs of the heels."""

@@ -35,11 +35,7 @@ FILTERING = GroupLayout(
             estimated together with camera positions, unlike that of `triangulation`
         """
     ),
-    labels={
-        "joint": COCO17,
-        "axis": ("x", "y"),
-        "wave": ("cos2", "cos3", "sin2", "sin3"),
-    },
+    labels={"joint": COCO17, "axis": ("x", "y"), "wave": ("cos2", "cos3", "sin2", "sin3")},
     attributes={"camera": "camera ids in the order of the camera dimension"},
 )
 """The detection dimension has the largest length among the cameras; the order is that of `ingest`

@@ -58,8 +58,7 @@ ClockOffset = Annotated[
 with linear change between them."""
 
 Cameras = Annotated[
-    Name | tuple[Name, ...] | None,
-    one_error("cameras", "the name of a camera, or a list of names"),
+    Name | tuple[Name, ...] | None, one_error("cameras", "the name of a camera, or a list of names")
 ]
 """The name of a camera, or those of several."""
 

@@ -23,11 +23,7 @@ PROPOSAL = GroupLayout(
     "says why.",
     coordinates=(FRAME,),
     arrays=(*CAMERA_ARRAYS, *_PLACES),
-    labels={
-        **CAMERA_LABELS,
-        "coordinate_2d": ("x", "y"),
-        "coordinate_2d_": ("x", "y"),
-    },
+    labels={**CAMERA_LABELS, "coordinate_2d": ("x", "y"), "coordinate_2d_": ("x", "y")},
     attributes={
         "camera_id": "camera of the match",
         "origin": "given, points (clicked), image (proposed from the image alone), or none",

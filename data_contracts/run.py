@@ -110,12 +110,7 @@ GatePolicy = Literal["auto", "always", "never"]
 """When results need approval: if metrics exceed their limits, always, or never."""
 
 RunState = Literal["complete", "waiting", "partial", "failed"]
-EXIT_CODES: Final[Mapping[RunState, int]] = {
-    "complete": 0,
-    "failed": 1,
-    "waiting": 3,
-    "partial": 4,
-}
+EXIT_CODES: Final[Mapping[RunState, int]] = {"complete": 0, "failed": 1, "waiting": 3, "partial": 4}
 """State of a run to the exit code of `worldpose run`."""
 
 

@@ -46,10 +46,7 @@ class ClickedMarkings(Record):
         }
 
 
-CAMERA_STEP = (
-    *("rx", "ry", "rz", "tx", "ty", "tz"),
-    *("log_focal", "cx", "cy", "k1", "k2", "k3"),
-)
+CAMERA_STEP = (*("rx", "ry", "rz", "tx", "ty", "tz"), *("log_focal", "cx", "cy", "k1", "k2", "k3"))
 """A step of a camera: rotation about its center [rad] and shift [m] in its own axes, the
 logarithm of the focal length, principal point [px], distortion [1]."""
 

@@ -19,13 +19,7 @@ EXCHANGED_PARTS = {
 
 
 HEALTH_MEASURES = (
-    "misfit",
-    "shift_px",
-    "clock_frames",
-    "unmatched",
-    "missing",
-    "brightness",
-    "sharpness",
+    *("misfit", "shift_px", "clock_frames", "unmatched", "missing", "brightness", "sharpness"),
 )
 """Health of a camera: robust loss of its keypoints about the people whom all cameras place, 1 as
 expected; shift of its view and clock offset as the people whom the others place show them; share

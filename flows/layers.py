@@ -209,12 +209,8 @@ def pitch_of_run(run: Run, otherwise: Callable[[], PitchSpec | None]) -> PitchSp
     `otherwise` gives the pitch of a run whose results do not say theirs. Tracks say its size alone.
     """
     for stage in (
-        "static_calibration",
-        "broadcast_calibration",
-        "bundle_adjustment",
-        "body_fitting",
-        "camera_consistency",
-        "tracking",
+        *("static_calibration", "broadcast_calibration", "bundle_adjustment"),
+        *("body_fitting", "camera_consistency", "tracking"),
     ):
         for name in (name for name in run if name.startswith(f"{stage}/")):
             place = (run.record.match_id, *name.split("/", 1), run.record.results[name])

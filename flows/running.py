@@ -19,14 +19,7 @@ from pydantic import JsonValue
 from data_contracts.run import GatePolicy, RunRecord
 from data_contracts.settings import IterationCount
 from flows.gates import Gatekeeper
-from flows.layers import (
-    ENVIRONMENT,
-    SETTINGS_LOCK,
-    Layer,
-    check_general,
-    read_layers,
-    write_layer,
-)
+from flows.layers import ENVIRONMENT, SETTINGS_LOCK, Layer, check_general, read_layers, write_layer
 from flows.method import METHOD, task_modules
 from flows.orchestration.local_cluster import (
     keep_workers,

@@ -22,17 +22,9 @@ from flows.stage import Match
 Figures = Mapping[str, float]
 
 DOUBTING: Final = (
-    "static_calibration",
-    "detection",
-    "camera_consistency",
-    "tracking",
-    "triangulation",
-    "bundle_adjustment",
-    "retriangulation",
-    "body_fitting",
-    "broadcast_calibration",
-    "broadcast_tracking",
-    "refitting",
+    *("static_calibration", "detection", "camera_consistency", "tracking"),
+    *("triangulation", "bundle_adjustment", "retriangulation", "body_fitting"),
+    *("broadcast_calibration", "broadcast_tracking", "refitting"),
 )
 """Stages whose warnings doubt their results; those of other stages describe the inputs."""
 _REPLACED: Final = {"triangulation": "retriangulation"}

@@ -14,11 +14,7 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats, GroupLayout, Integers
 from data_contracts.body_fitting import BODY_FITTING
 from data_contracts.keypoints import KeypointDetections
-from tasks.clip_inputs import (
-    PagedArray,
-    open_tracked_clip,
-    triangulation_settings,
-)
+from tasks.clip_inputs import PagedArray, open_tracked_clip, triangulation_settings
 from tasks.triangulation import camera_errors
 from tasks.unit import UnitInputs, figures_of, unit_task
 from worldpose.body.body_file import find_body

@@ -332,10 +332,7 @@ def broadcast_tracking(inputs: UnitInputs, result: ResultWriter) -> None:
             "ground_covariance": tracks.covariance.astype(np.float32),
             "ground_height": tracks.height.astype(np.float32),
         },
-        coordinates={
-            "frame": inputs.frames,
-            "person": person.astype(np.int32),
-        },
+        coordinates={"frame": inputs.frames, "person": person.astype(np.int32)},
         attributes={
             "clip_id": inputs.unit,
             **given_people,

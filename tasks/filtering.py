@@ -216,11 +216,7 @@ class _Case:
         boxes = detections.confidence.shape[:3]
         before = np.zeros(boxes, dtype=np.bool_) if self.dropped is None else self.dropped[frames]
         return TriangulatedDetections(
-            detections,
-            offsets.astype(np.float64),
-            exchanged,
-            before,
-            self.triangulation.noise,
+            detections, offsets.astype(np.float64), exchanged, before, self.triangulation.noise
         )
 
 
@@ -261,10 +257,7 @@ def _counts(
 
 
 def _held_out(
-    inputs: UnitInputs,
-    case: _Case,
-    frames: NDArray[np.int64],
-    suspects: TriangulatedDetections,
+    inputs: UnitInputs, case: _Case, frames: NDArray[np.int64], suspects: TriangulatedDetections
 ) -> dict[str, float]:
     """Measure the held-out error of cameras from the keypoints that this iteration uses.
 
@@ -461,9 +454,7 @@ def _arrays(
     more = int(behind.max(initial=-1)) + 1
     arrays: dict[str, NDArray[Any]] = {
         name: np.pad(
-            values,
-            [(0, 0), (0, more)] + [(0, 0)] * (values.ndim - 2),
-            constant_values=np.nan,
+            values, [(0, 0), (0, more)] + [(0, 0)] * (values.ndim - 2), constant_values=np.nan
         )
         for name, values in case.detected.arrays().items()
     }

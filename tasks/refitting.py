@@ -16,13 +16,7 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.body_fitting import REFITTING
 from data_contracts.keypoints import KeypointDetections
-from tasks.body_fitting import (
-    ClipPeople,
-    FurtherArrays,
-    find_same_body,
-    frame_arrays,
-    write_fit,
-)
+from tasks.body_fitting import ClipPeople, FurtherArrays, find_same_body, frame_arrays, write_fit
 from tasks.broadcast_calibration import BroadcastInputs, image_clock, open_broadcast
 from tasks.clip_inputs import select_frames
 from tasks.unit import UnitInputs, figures_of, unit_task
@@ -307,11 +301,7 @@ def _calibration_covariance(
 
 
 def _report_plane_bodies(
-    result: ResultWriter,
-    fit: BodyFit,
-    evidence: PlaneEvidence,
-    kept: Flags,
-    persons: Integers,
+    result: ResultWriter, fit: BodyFit, evidence: PlaneEvidence, kept: Flags, persons: Integers
 ) -> None:
     """Write the metrics of the bodies, named as those of triangulated people."""
     frames, count = evidence.place.shape[:2]

@@ -351,11 +351,7 @@ def _locate_feet(clip: ClipInputs, pitch: PitchTemplate, chosen: NDArray[np.bool
         there = np.isfinite(detections.confidence).any(-1) | np.isfinite(detections.boxes).all(-1)
         own = np.asarray(there if chosen is None else there & chosen[rows])
         located = locate_feet(
-            clip.cameras,
-            detections,
-            pitch,
-            camera_covariance=clip.camera_covariance,
-            chosen=own,
+            clip.cameras, detections, pitch, camera_covariance=clip.camera_covariance, chosen=own
         )
         order = np.argsort(~own, axis=2, kind="stable")[:, :, : max(1, int(own.sum(axis=2).max()))]
         index = np.where(np.take_along_axis(own, order, axis=2), order, -1)

@@ -32,6 +32,15 @@ def look_at_camera(
     return Camera(focal, np.array(middle), np.array(lens), pose, np.array(size))
 
 
+def ring_of_cameras(angles, up, aim, focal, *, away=30.0, **more):
+    """Return cameras at angles (n,) [rad] around the origin, one or n heights [m] up."""
+    places = [
+        (away * np.cos(angle), away * np.sin(angle), height)
+        for angle, height in zip(angles, np.broadcast_to(up, len(angles)), strict=True)
+    ]
+    return Camera.stack([look_at_camera(place, aim, focal, **more) for place in places])
+
+
 def plain_camera(focal, middle, pose, size=(1920, 1080), *, lens=(0.0,) * 5):
     """Return the cameras of focal lengths (...,) [px] and their poses, with square pixels."""
     focal = np.repeat(np.array(focal, dtype=float)[..., None], 2, axis=-1)

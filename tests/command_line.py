@@ -96,6 +96,15 @@ def _run_warm(arguments, timeout):
         return Answer(code, *(Path(file.name).read_text() for file in (out, err)))
 
 
+def invoke(*words, **keywords):
+    """The command line in this process, which takes no seconds to start; Typer's result."""
+    from typer.testing import CliRunner  # late: most tests need neither
+
+    from flows.cli.app import app
+
+    return CliRunner().invoke(app, list(map(str, words)), **keywords)
+
+
 def succeed(*arguments, **keywords):
     """Runs the command line and expects exit code 0."""
     answer = worldpose(*arguments, **keywords)

@@ -40,10 +40,7 @@ def server():
     options = {**local_cluster_options(1), "host": "127.0.0.1"}
     stages = [f"tasks.{name}" for name in STAGES]
     options["preload"] = ["tasks.preload", "prefect_dask", *stages, "flows.match"]
-    with (
-        prefect_server(is_local=True) as wait_until_ready,
-        LocalCluster(**options) as cluster,
-    ):
+    with prefect_server(is_local=True) as wait_until_ready, LocalCluster(**options) as cluster:
         # Before the scheduler, a thread of this process, would do it while it receives the first
         # task: on busy cores it then did not answer for so long that its clients gave up.
         for name in options["preload"][1:]:

@@ -33,9 +33,7 @@ if TYPE_CHECKING:
     from worldpose.body_fitting.results import ClipEvidence as ClipEvidence
     from worldpose.body_fitting.settings import BodyFittingSettings as BodyFittingSettings
     from worldpose.broadcast_calibration.estimate import BroadcastClip as BroadcastClip
-    from worldpose.broadcast_calibration.estimate import (
-        calibrate_broadcast as calibrate_broadcast,
-    )
+    from worldpose.broadcast_calibration.estimate import calibrate_broadcast as calibrate_broadcast
     from worldpose.broadcast_calibration.settings import (
         BroadcastCalibrationSettings as BroadcastCalibrationSettings,
     )

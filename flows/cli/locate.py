@@ -14,12 +14,7 @@ from data_contracts.match import ClockOffset
 from flows.cli import console
 from flows.cli.options import DEFAULT_PROJECT
 from flows.registering import find_match
-from flows.results.clock_offsets import (
-    ClockOffsets,
-    choose_clip,
-    find_offsets,
-    load_detections,
-)
+from flows.results.clock_offsets import ClockOffsets, choose_clip, find_offsets, load_detections
 from flows.results.outputs import claim_file, require_new
 from flows.run_record import alone_with
 from flows.running import RunRequest, run_match

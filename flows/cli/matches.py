@@ -280,10 +280,7 @@ def import_pitch(
     file = out / "pitch.json"
     if file.exists():
         raise UsageError(
-            str(file),
-            expected="no pitch there yet",
-            found="one",
-            todo="Move the file away first.",
+            str(file), expected="no pitch there yet", found="one", todo="Move the file away first."
         )
     fit = fit_survey(
         read_survey(survey, template or "football"), SurveySettings(left_handed=left_handed)

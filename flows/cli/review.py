@@ -140,11 +140,7 @@ def show(
 
 @commands.command()
 def approve(
-    store: Store,
-    match: MatchId,
-    who: str,
-    requests: Requests = None,
-    why: Why = "",
+    store: Store, match: MatchId, who: str, requests: Requests = None, why: Why = ""
 ) -> None:
     """Approve results; the verdict applies to their bytes, also in later runs.
 
@@ -372,9 +368,7 @@ def import_annotations(
 
 @commands.command("convert")
 def convert_annotations(
-    file: Annotated[Path, typer.Argument(metavar="FILE")],
-    out: Path,
-    form: FormatOption = "coco",
+    file: Annotated[Path, typer.Argument(metavar="FILE")], out: Path, form: FormatOption = "coco"
 ) -> None:
     """Convert annotations to another format, for example COCO labels to CVAT, or CVAT to COCO.
 

@@ -13,11 +13,7 @@ from urllib.parse import quote, urlsplit
 
 import httpx
 
-from flows.orchestration.prefect_environment import (
-    CLOUD_LOGIN,
-    LOOPBACK_NAMES,
-    authorization,
-)
+from flows.orchestration.prefect_environment import CLOUD_LOGIN, LOOPBACK_NAMES, authorization
 from worldpose.errors import WorldposeError
 
 ANSWER_SECONDS: Final = 20.0

@@ -39,10 +39,7 @@ RUN_HOME = "worldpose-prefect-"
 START_SECONDS = 120.0
 """The very first start creates Prefect's database, which took 15 s on two busy cores."""
 
-ALWAYS = {
-    "DO_NOT_TRACK": "1",
-    "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
-}
+ALWAYS = {"DO_NOT_TRACK": "1", "PREFECT_SERVER_ANALYTICS_ENABLED": "false"}
 AUTHORITIES = "PREFECT_API_SSL_CERT_FILE"
 LOOPBACK = "127.0.0.1,localhost"
 """Addresses that bypass proxies."""

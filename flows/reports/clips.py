@@ -11,12 +11,7 @@ from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.pitch import PitchSpec
 from flows.reports.clip_video import mark_places, people_at_images
 from flows.reports.match_pictures import background_image, frame_picture, shown_pitch
-from flows.results.best_results import (
-    Origin,
-    clip_title,
-    joint_tracks,
-    placed_joints,
-)
+from flows.results.best_results import Origin, clip_title, joint_tracks, placed_joints
 from flows.results.run_cameras import static_cameras
 from flows.results.tool_exports import ImageView, image_views
 from flows.stage import Match

@@ -13,12 +13,7 @@ from flows.stage import Match
 from flows.stages.detection import seen_by, seen_by_cameras
 from worldpose.errors import InputError, unknown_name
 from worldpose.geometry.cameras import Camera
-from worldpose.ingest.clock import (
-    exact_frames,
-    offset_change,
-    remaining_offset,
-    simplest_offset,
-)
+from worldpose.ingest.clock import exact_frames, offset_change, remaining_offset, simplest_offset
 from worldpose.ingest.footage import UnitFrames, unit_frames
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.store import Run

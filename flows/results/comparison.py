@@ -77,10 +77,7 @@ class SubjectChange:
 
 
 def compare_runs(
-    store: Store,
-    a: RunRecord,
-    b: RunRecord,
-    paired: Mapping[tuple[str, str], str] | None = None,
+    store: Store, a: RunRecord, b: RunRecord, paired: Mapping[tuple[str, str], str] | None = None
 ) -> list[SubjectChange]:
     """Compare the match, its clips, cameras and players in B with A.
 

@@ -25,12 +25,7 @@ from flows.results.run_cameras import (
     view_changes,
     with_brown_lenses,
 )
-from flows.results.tool_exports import (
-    TOOL_EXPORTS,
-    export_alphapose,
-    export_coco,
-    filmed_cameras,
-)
+from flows.results.tool_exports import TOOL_EXPORTS, export_alphapose, export_coco, filmed_cameras
 from worldpose.dataset import manifest as manifests
 from worldpose.errors import InputError, UsageError, unknown_name
 from worldpose.formats import challenge

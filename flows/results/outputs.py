@@ -12,13 +12,7 @@ from typing import Final
 
 from pydantic import TypeAdapter, ValidationError
 
-from worldpose.dataset.manifest import (
-    FRAME_RATES,
-    KINDS,
-    LENS_ERRORS,
-    MANIFEST,
-    read_manifest,
-)
+from worldpose.dataset.manifest import FRAME_RATES, KINDS, LENS_ERRORS, MANIFEST, read_manifest
 from worldpose.errors import InputError
 from worldpose.formats.files import FULL, whole_file
 

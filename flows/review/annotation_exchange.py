@@ -42,11 +42,7 @@ class Exported:
 
 
 def export_people(
-    store: Store,
-    match: Match,
-    places: Sequence[tuple[str, int]],
-    folder: Path,
-    form: Format,
+    store: Store, match: Match, places: Sequence[tuple[str, int]], folder: Path, form: Format
 ) -> Exported:
     """Write detections and images for an annotation tool.
 

@@ -245,10 +245,7 @@ def _decided_meanwhile(name: str, review: Review, seen: str | None) -> StaleEdit
     decision = review.decision
     found = review.state if decision is None else f"{decision.verdict} by {decision.who}"
     error = StaleEditError(
-        f"review {name}",
-        expected=f"{seen}, as it was shown",
-        found=found,
-        todo="Look at it again.",
+        f"review {name}", expected=f"{seen}, as it was shown", found=found, todo="Look at it again."
     )
     error.difference = {
         "review": name,

@@ -266,9 +266,4 @@ CONTENT: Final = ("alert", "match", "text", "link")
 
 def _content(alert: Alert) -> dict[str, str]:
     """Return the JSON content; chat services show `text`."""
-    return {
-        "alert": alert.alert,
-        "match": alert.match_id,
-        "text": alert.text,
-        "link": alert.link,
-    }
+    return {"alert": alert.alert, "match": alert.match_id, "text": alert.text, "link": alert.link}

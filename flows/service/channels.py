@@ -120,12 +120,7 @@ def apprise_mail(address: str) -> str:
         ) from None
     login = parts.netloc.rpartition("@")[0]
     mode = "ssl" if is_secure else "starttls" if login else "insecure"
-    query = {
-        "mode": mode,
-        "from": asked.get("from", to)[0],
-        "to": ",".join(to),
-        "format": "text",
-    }
+    query = {"mode": mode, "from": asked.get("from", to)[0], "to": ",".join(to), "format": "text"}
     scheme = "mailto" if mode == "insecure" else "mailtos"
     return f"{scheme}://{login}{'@' * bool(login)}{server}:{port}/?{urlencode(query)}"
 

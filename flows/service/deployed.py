@@ -191,11 +191,7 @@ def ingest(plan: dict[str, Any]) -> list[str]:
         return runs.start(opened.match_id, priority=arrival.priority, key=key).flow_run
 
     decided = take_in(
-        Store.open(served.project),
-        served.state_folder,
-        served.inbox,
-        served.settle_seconds,
-        begin,
+        Store.open(served.project), served.state_folder, served.inbox, served.settle_seconds, begin
     )
     for arrival in decided:
         LOG.info("%s: %s %s", arrival.name, arrival.state, arrival.reason)

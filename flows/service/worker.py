@@ -20,12 +20,7 @@ from prefect.client.orchestration import PrefectClient
 from prefect.client.schemas.objects import FlowRun, State, StateType
 from prefect.exceptions import ParameterTypeError, SignatureMismatchError
 from prefect.states import Cancelled, Crashed, Failed
-from prefect.workers.base import (
-    BaseJobConfiguration,
-    BaseVariables,
-    BaseWorker,
-    BaseWorkerResult,
-)
+from prefect.workers.base import BaseJobConfiguration, BaseVariables, BaseWorker, BaseWorkerResult
 
 from data_contracts.operations import QueuedRun
 from flows.service.run_queue import queue_of_parameters, queued_run

@@ -357,11 +357,7 @@ def _group(context: PageContext, match: Match, owner: str, frame: int, detection
 
 
 def _describe_view(
-    match: Match,
-    group: Group,
-    owner: str,
-    joint: int | None,
-    at: tuple[float, float] | None,
+    match: Match, group: Group, owner: str, joint: int | None, at: tuple[float, float] | None
 ) -> dict[str, Any]:
     own = group.names.index(owner)
     keypoints = group.keypoints.copy()

@@ -17,13 +17,7 @@ from starlette.requests import ClientDisconnect
 
 from data_contracts.operations import Priority
 from data_contracts.records import Count, Record
-from flows.service.inbox import (
-    RefusalError,
-    find_refused,
-    fingerprint_of,
-    remove_entry,
-    try_again,
-)
+from flows.service.inbox import RefusalError, find_refused, fingerprint_of, remove_entry, try_again
 from flows.service.layout import served_state
 from flows.web.app_context import PageContext, Person
 from flows.web.browser_words import in_browser

@@ -101,11 +101,7 @@ def routes(context: PageContext) -> APIRouter:
 
 
 def _choose(
-    context: PageContext,
-    found: Sequence[MatchSummary],
-    search: str,
-    kind: str,
-    page: int,
+    context: PageContext, found: Sequence[MatchSummary], search: str, kind: str, page: int
 ) -> dict[str, Any]:
     """Return the matches of a page of those sought, and what the page says about all."""
     running, sought = context.continuing.running(), []

@@ -12,13 +12,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from camera_builders import look_at_camera
-from command_line import TINY, worldpose
+from command_line import TINY, invoke, worldpose
 from test_release_formats import match_folder, origin, tracked
-from typer.testing import CliRunner
 
 from data_contracts.release import EXPORT_FORMATS, EXPORT_PURPOSES
 from flows import registering
-from flows.cli.app import app
 from flows.results import export as export_module
 from flows.results import outputs
 from flows.results.best_results import Origin
@@ -239,7 +237,7 @@ def test_a_report_without_a_run_asks_for_one_and_does_not_speak_of_images(tmp_pa
     known = SimpleNamespace(match_id="m", folder=SimpleNamespace(videos={}, clicked={}))
     monkeypatch.setattr(registering, "find_match", away)
     monkeypatch.setattr(registering, "open_stored", lambda *_: known)
-    done = CliRunner().invoke(app, ["report", "m", "--project", str(tmp_path / "project")])
+    done = invoke("report", "m", "--project", tmp_path / "project")
     assert "run" in str(done.exception)
     assert "has no images" not in done.stderr
 
@@ -276,7 +274,7 @@ def test_a_lens_that_cannot_be_followed_is_refused_before_the_first_file(
 
 
 def test_every_format_has_a_writer_and_is_named_in_the_help_and_the_reference():
-    help_text = CliRunner().invoke(app, ["export", "--help"], env={"COLUMNS": "200"}).output
+    help_text = invoke("export", "--help", env={"COLUMNS": "200"}).output
     help_text = re.sub(r"-\n\s+", "-", help_text)  # a line may end at a hyphen
     page = (Path(__file__).parents[2] / "docs/reference/formats.md").read_text()
     assert tuple(EXPORTS) == EXPORT_FORMATS

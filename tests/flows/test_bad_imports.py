@@ -6,10 +6,9 @@ import shutil
 
 import numpy as np
 import pytest
+from command_line import invoke
 from run_records import calibration
-from typer.testing import CliRunner
 
-from flows.cli.app import app
 from flows.web.draft_problems import take_given
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.calibration_forms import read_calibration
@@ -40,7 +39,7 @@ NOISE = bytes(range(7, 255)) * 4
 
 
 def run(*arguments):
-    return CliRunner().invoke(app, ["import", *map(str, arguments)])
+    return invoke("import", *arguments)
 
 
 def refuse(*arguments):
@@ -82,16 +81,8 @@ CLICKS = "--clicks LAB/{} --camera a --out LAB/match"
 FORMS = {
     **dict.fromkeys(
         [
-            "bad.toml",
-            "bad.qca.txt",
-            "bad.xml",
-            "bad.json",
-            "bad.yml",
-            "bad.xcp",
-            "bad.mcal",
-            "bad.calib",
-            "bad.pickle",
-            "intri.yml",
+            *("bad.toml", "bad.qca.txt", "bad.xml", "bad.json", "bad.yml"),
+            *("bad.xcp", "bad.mcal", "bad.calib", "bad.pickle", "intri.yml"),
         ],
         f"--calibration LAB/{{}} {POSES}",
     ),

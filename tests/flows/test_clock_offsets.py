@@ -9,13 +9,11 @@ import numpy as np
 import page_client
 import pytest
 import yaml
-from command_line import succeed
-from typer.testing import CliRunner
+from command_line import invoke, succeed
 
 from data_contracts.cameras import LensCalibration
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from flows.cli import console
-from flows.cli.app import app
 from flows.cli.locate import _lens, _print_offsets
 from flows.results.clock_offsets import ClockOffsets, Proposal, propose
 from flows.run_record import latest_run
@@ -138,8 +136,7 @@ def test_the_page_shows_the_same_proposal_and_applies_it_in_the_next_version(
 )
 def test_wrong_options_are_told_before_anything_is_computed(shifted, tmp_path, options, told):
     Store.create(tmp_path / "p")
-    command = ["synchronize", str(shifted), "--project", str(tmp_path / "p"), *options]
-    result = CliRunner().invoke(app, command)
+    result = invoke("synchronize", shifted, "--project", tmp_path / "p", *options)
     assert isinstance(result.exception, UsageError)
     assert told in str(result.exception)
 
@@ -220,7 +217,7 @@ def boards(tmp_path_factory):
 
 
 def calibrate(*arguments):
-    return CliRunner().invoke(app, ["calibrate", *map(str, arguments)])
+    return invoke("calibrate", *arguments)
 
 
 def test_images_and_a_video_become_lenses(boards, tmp_path):
@@ -331,9 +328,7 @@ def test_cameras_are_found_and_written_in_place_of_lenses(server, lab, tmp_path)
     assert off.max() < 0.03 * far
     stated = np.array([found["cameras"][name]["position_std_m"] for name in truth])
     assert (off < 4.0 * stated + 0.05).all()
-    refused = CliRunner().invoke(
-        app, ["locate-cameras", str(folder), *map(str, options), "--apply"]
-    )
+    refused = invoke("locate-cameras", folder, *options, "--apply")
     assert isinstance(refused.exception, InputError)
     assert "calibration.toml: expected no calibration there yet" in str(refused.exception)
 
@@ -368,7 +363,6 @@ def test_wrong_options_of_locating_are_told_before_anything_is_computed(
     lab, tmp_path, options, told
 ):
     folder, _ = lab
-    command = ["locate-cameras", str(folder), "--project", str(tmp_path / "p"), *options]
-    result = CliRunner().invoke(app, command)
+    result = invoke("locate-cameras", folder, "--project", tmp_path / "p", *options)
     assert isinstance(result.exception, UsageError)
     assert told in str(result.exception)

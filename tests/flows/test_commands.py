@@ -8,8 +8,8 @@ import sys
 import pytest
 import typer
 import yaml
+from command_line import invoke
 from run_records import calibration, match_spec, run_record
-from typer.testing import CliRunner
 
 from data_contracts.run import UnitFailure, WaitingUnit
 from flows.cli import run as run_command
@@ -29,7 +29,7 @@ def test_every_command_loads_and_is_listed_with_its_help(name):
     first = " ".join(command.help.partition("\n\n")[0].split())
     assert first == summary(name)
     assert hasattr(command, "commands") or "Example: worldpose" in command.help
-    listed = CliRunner().invoke(app, ["--help"]).output
+    listed = invoke("--help").output
     assert f"\n  {name} " in listed
 
 
@@ -80,7 +80,7 @@ def test_a_shell_completes_the_names_of_commands():
 
 
 def test_a_misspelt_command_names_the_one_that_may_be_meant():
-    answer = CliRunner().invoke(app, ["simualte"])
+    answer = invoke("simualte")
     assert answer.exit_code == 2
     assert "No such command 'simualte'. Did you mean simulate?" in answer.output
 
@@ -114,7 +114,7 @@ def store(tmp_path):
 
 
 def said(store, *arguments):
-    return CliRunner().invoke(app, [*arguments, "--project", store.url])
+    return invoke(*arguments, "--project", store.url)
 
 
 def test_settings_are_not_listed_and_changed_at_once(store):
@@ -238,10 +238,10 @@ def test_a_clip_much_longer_than_its_2d_poses_is_told_where_files_are_given(
 
 
 def test_a_match_of_the_second_world_is_made_by_name(tmp_path):
-    listed = CliRunner().invoke(app, ["simulate", "--scenario", "list", "--json"])
+    listed = invoke("simulate", "--scenario", "list", "--json")
     assert "foreign-mixed" in json.loads(listed.stdout)["scenarios"]
     words = ["simulate", "--scenario", "foreign-lab", "--seed", "1", "--duration", "0.2", "--json"]
-    done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "lab")])
+    done = invoke(*words, "--out", tmp_path / "lab")
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["match"] == "foreign-lab-1-0.2s"
     assert (tmp_path / "lab" / "reference" / "world.json").is_file()
@@ -252,9 +252,8 @@ def test_a_match_of_the_second_world_is_made_by_name(tmp_path):
     [("foreign-lab", "--render"), ("foreign-lab", "--mocap"), ("tiny", "--recordings")],
 )
 def test_an_option_that_a_scenario_does_not_have_is_refused(tmp_path, scenario, option):
-    value = [] if option == "--render" else [str(tmp_path)]
-    words = ["simulate", "--scenario", scenario, "--out", str(tmp_path / "out"), option, *value]
-    done = CliRunner().invoke(app, words)
+    value = [] if option == "--render" else [tmp_path]
+    done = invoke("simulate", "--scenario", scenario, "--out", tmp_path / "out", option, *value)
     assert isinstance(done.exception, UsageError)
     assert done.exception.where == option
     assert not (tmp_path / "out").exists()

@@ -1,6 +1,6 @@
-"""A match is created in a real browser, through a restart of the server and a reload."""
+"""A match is created and gets more files in a real browser, through a restart and refusals."""
 
-import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -11,14 +11,20 @@ import cv2
 import numpy as np
 import page_client
 import pytest
+import yaml
 from chromium import IN_BROWSER, drive
+from command_line import TINY, succeed
+from test_clock_offsets import shift
+from test_page_drafts import a_match
 
+from flows.registering import open_for_review
 from worldpose.ingest.match_folder import read_match
 from worldpose.store.store import Store
 from worldpose.video.files import write_video
 
-pytestmark = [*IN_BROWSER, pytest.mark.timeout(900)]
-SCRIPT = Path(__file__).with_name("create_match_in_browser.mjs")
+pytestmark = [*IN_BROWSER, pytest.mark.timeout(1500)]
+CREATING = Path(__file__).with_name("create_match_in_browser.mjs")
+ADDING = Path(__file__).with_name("versions_in_browser.mjs")
 SERVER = """
 import sys
 from pathlib import Path
@@ -27,8 +33,24 @@ from flows.web.intake import Intake
 from flows.web.app import serve
 place, port, token = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
 access = access_for("127.0.0.1", token=token, names=(), secure=False)
-intake = Intake(place / "inbox", (place / "videos",))
+intake = Intake(place / "inbox", tuple(map(Path, sys.argv[4:])))
 serve(str(place / "project"), access, host="127.0.0.1", port=port, tls=None, intake=intake)
+"""
+WITH_INBOX = """
+import sys, threading, time
+from pathlib import Path
+from flows.service.inbox import take_in, watch_once
+from flows.service.layout import served_state
+from worldpose.store.store import Store
+place = Path(sys.argv[1])
+store = Store.open(str(place / "project"))
+state = served_state(store.url)
+def watch():
+    while True:
+        if watch_once(state, place / "inbox", 1.0):
+            take_in(store, state, place / "inbox", 1.0, lambda match, arrival: "")
+        time.sleep(0.5)
+threading.Thread(target=watch, daemon=True).start()
 """
 
 
@@ -61,14 +83,15 @@ def test_a_match_is_created_through_a_restart_and_a_reload(tmp_path):
     assert size > 2_000_000
     port, signal = page_client.free_port(), tmp_path / "signal"
     command = [sys.executable, "-c", SERVER, str(tmp_path), str(port), page_client.TOKEN]
-    servers = [subprocess.Popen(command, env=os.environ)]
+    command.append(str(tmp_path / "videos"))
+    servers = [subprocess.Popen(command)]
 
     def restart():
         wait_for(signal.with_suffix(".restart"))
         servers[0].kill()
         servers[0].wait()
         wait_for(signal.with_suffix(".seen"))
-        servers.append(subprocess.Popen(command, env=os.environ))
+        servers.append(subprocess.Popen(command))
         signal.with_suffix(".restarted").touch()
 
     threading.Thread(target=restart, daemon=True).start()
@@ -84,7 +107,7 @@ def test_a_match_is_created_through_a_restart_and_a_reload(tmp_path):
             "size": size,
             "signal": str(signal),
         }
-        seen = drive(SCRIPT, task, tmp_path, 600)
+        seen = drive(CREATING, task, tmp_path, 600)
     finally:
         for server in servers:
             server.kill()
@@ -122,3 +145,48 @@ def test_a_match_is_created_through_a_restart_and_a_reload(tmp_path):
         ("kane", "Harry Kane", "player"),
         ("pickford", "Jordan Pickford", "goalkeeper"),
     ]
+
+
+def refused(folder, video, **changes):
+    (folder / "videos").mkdir(parents=True)
+    shutil.copy(video, folder / "videos" / "near.mp4")
+    camera = {"side": "near", "width": 320, "height": 180}
+    content = a_match("videos/near.mp4", match_id=folder.name, camera=camera, **changes)
+    (folder / "match.yaml").write_text(yaml.safe_dump(content))
+
+
+def test_a_match_gets_a_camera_and_offsets_and_refused_ones_lead_back(server, tiny, tmp_path):
+    folder, inbox = shift(tiny, tmp_path / "m"), tmp_path / "inbox"
+    succeed("run", folder, "--until", "detection", "--project", tmp_path / "project")
+    write_noise(tmp_path / "roof.mp4", 60)
+    refused(inbox / "cup", tmp_path / "roof.mp4", fps=-25)
+    refused(inbox / "old", tmp_path / "roof.mp4", roster=[{"id": "a/b", "name": "A"}])
+    before = (folder / "match.yaml").read_bytes()
+    port = page_client.free_port()
+    program = WITH_INBOX + SERVER
+    server = subprocess.Popen(
+        [sys.executable, "-c", program, str(tmp_path), str(port), page_client.TOKEN]
+    )
+    base = f"http://127.0.0.1:{port}"
+    try:
+        page_client.wait_until_up(base)
+        task = {"base": base, "token": page_client.TOKEN, "match": TINY}
+        task["damaged"] = str(inbox / "cup" / "match.yaml")
+        seen = drive(ADDING, {**task, "video": str(tmp_path / "roof.mp4")}, tmp_path, 1200)
+    finally:
+        server.kill()
+        server.wait()
+    assert "fps" in seen["reason"]
+    assert "cam02" in seen["apply"]
+    assert seen["title"] == f"Add files to {TINY}"
+    assert seen["foreseen"].startswith("Before the next run, roof must be calibrated")
+    assert [value for name, value in seen.items() if name.startswith("overflow")] == [0] * 18
+    store = Store.open(str(tmp_path / "project"))
+    match = open_for_review(store, TINY)
+    assert match.folder.folder == inbox / f"{TINY}.v3"
+    assert "roof" in match.folder.videos and len(store.runs(TINY)) == 1
+    assert match.folder.spec.camera("cam02").offset_frames == 0
+    assert (folder / "match.yaml").read_bytes() == before
+    cup = open_for_review(store, "cup").folder
+    assert (cup.folder.name, cup.spec.fps, seen["corrected"]) == ("cup.v2", 25, "25")
+    assert not (inbox / "old").exists() and len([*(inbox / ".removed").iterdir()]) == 2

@@ -6,11 +6,9 @@ from contextlib import suppress
 from datetime import UTC, datetime
 
 import pytest
-from command_line import TINY, worldpose
-from typer.testing import CliRunner
+from command_line import TINY, invoke, worldpose
 
 from data_contracts.review import MovedPoint, ReviewDecision
-from flows.cli.app import app
 from flows.cli.locate import compute_poses
 from flows.gates import GATES, Gatekeeper
 from flows.match import IncompleteRunError
@@ -323,7 +321,7 @@ def test_people_are_asked_and_answer_on_the_command_line(tiny, project_copy, tmp
 
     def say(*arguments):
         """Return the output of a command, run in this process to save seconds."""
-        return CliRunner().invoke(app, [*map(str, arguments), *at])
+        return invoke(*arguments, *at)
 
     reviews = json.loads(say("review", "list", "--json").stdout)["reviews"]
     assert {(each["state"], each["match_id"]) for each in reviews} == {("waits", TINY)}

@@ -1,19 +1,48 @@
 """Corrections of identities over stored tracks, with and without those before the corrections."""
 
 from dataclasses import replace
+from datetime import UTC, datetime
+from importlib import import_module
 from types import SimpleNamespace
 
 import numpy as np
+import page_client
 import pytest
 import xarray as xr
+from command_line import TINY, succeed
+from page_client import MATCH
 from run_records import correction
 
-from data_contracts.review import MergedTracks, MovedPoint, NamedTrack, SplitTrack
+from data_contracts.match import PlayerSpec
+from data_contracts.review import (
+    Correction,
+    DeletedDetection,
+    MergedTracks,
+    MovedPoint,
+    NamedTrack,
+    SplitTrack,
+)
+from flows.registering import open_match
+from flows.results.best_results import clip_positions
 from flows.review import corrections, identities
-from flows.review.edit_conflicts import StoredResult
+from flows.review.corrections import keep_edits, objections_of
+from flows.review.edit_conflicts import StaleEditError, StoredResult
+from flows.review.identities import identities_now, lost_names, names_of
+from flows.review.verdicts import correct, origins_of, withdraw
+from flows.run_plan import plan_run
+from flows.run_record import RunLog, latest_run
+from flows.settings import selected_stages
+from tasks.tracking import tracking
 from worldpose.errors import StoreError
-from worldpose.review.identities import IdentityReplay, replay_identities, stored_identities
-from worldpose.review.journal import Journal
+from worldpose.review.identities import (
+    IdentityReplay,
+    find_sighting,
+    replay_identities,
+    stored_identities,
+)
+from worldpose.review.journal import Journal, append, read_journal
+from worldpose.store.paths import ResultId
+from worldpose.store.store import Run
 
 FRAMES = 12
 
@@ -206,3 +235,223 @@ def test_of_equal_corrections_a_result_has_each_once(said, withdrawn, taken, use
     found = identities._said_in(journal(said, withdrawn), "clip", moves)
     assert [*found] == [*used]
     assert identities._said_in(journal(said, withdrawn), "other", []) == {}
+
+
+def say(store, **edits):
+    return keep_edits(store, lambda: open_match(store, TINY), edits, who="Ada", note="")
+
+
+def planned(store):
+    """The unit of tracking as the next run would have it."""
+    units = plan_run(store, open_match(store, TINY), {})
+    return next(unit for unit in units if unit.recipe.stage == "tracking")
+
+
+def compute(store, unit):
+    tracking.fn(unit.work(store.url, open_match(store, TINY), "0009"))
+    return store.manifest(TINY, "tracking", unit.recipe.unit, unit.key)
+
+
+def test_a_split_and_a_merge_are_in_the_tracks_and_replayed_to_the_same_bytes(store):
+    before = planned(store)
+    clip = before.recipe.unit
+    found = identities_now(store, open_match(store, TINY), clip).identities
+    middle = int(found.frame[len(found.frame) // 2])
+    seen = find_sighting(found, 0)
+    say(store, a=SplitTrack(clip=clip, person=0, seen=seen, first_frame_of_new=middle))
+    after = planned(store)
+    assert before.published
+    assert not after.published
+    first = compute(store, after)
+    data = store.open_result(TINY, "tracking", clip, after.key)
+    new = int(found.person.max()) + 1
+    assert data["person"].values.tolist() == [*found.person.tolist(), new]
+    halves = (data["detection_index"].sel(person=[0, new]) >= 0).any("camera").values
+    assert halves[: len(halves) // 2, 1].sum() == 0
+    assert halves[len(halves) // 2 :, 0].sum() == 0
+    assert data.attrs["objections"] == [None]
+    # Without the tracker's own result it tracks again, and gives the same bytes.
+    for key in (before.key, after.key):
+        store.withdraw(ResultId(TINY, "tracking", clip, key))
+    again = compute(store, planned(store))
+    assert (again.content, again.figures) == (first.content, first.figures)
+    compute(store, before)
+    # Merged again, all identities are the former ones.
+    merge = MergedTracks(clip=clip, kept=0, merged=new)
+    say(store, b=merge)
+    compute(store, planned(store))
+    whole = store.open_result(TINY, "tracking", clip, planned(store).key)
+    assert (whole["detection_index"].values == found.detection_index).all()
+    corrections = open_match(store, TINY).journal.standing.values()
+    assert [type(each) for each in corrections] == [Correction, Correction]
+
+
+def test_an_edit_of_somebody_who_is_another_by_now_is_refused(store):
+    clip = planned(store).recipe.unit
+    found = identities_now(store, open_match(store, TINY), clip).identities
+    middle = int(found.frame[len(found.frame) // 2])
+    seen = find_sighting(found, 0, first=middle)
+    split = SplitTrack(clip=clip, person=0, seen=seen, first_frame_of_new=middle)
+    say(store, a=split)
+    say(store, a=split)  # the same edit sent again is kept once
+    assert len(open_match(store, TINY).corrections) == 1
+    with pytest.raises(StaleEditError, match="person 0 is not the person that was seen"):
+        say(store, b=split)
+    before, unit = latest_run(store, TINY), planned(store)
+    compute(store, unit)
+    results = {**before.results, f"tracking/{clip}": unit.key}
+    after = before.model_copy(update={"results": results})
+    runs = ((before, "automatic"), (after, "corrected"))
+    for latest, origin in runs:
+        assert origins_of(store, open_match(store, TINY), latest)[f"tracking/{clip}"] == origin
+
+
+def test_a_name_recomputes_nothing_and_is_in_the_tables_at_once(store):
+    clip = planned(store).recipe.unit
+    found = identities_now(store, open_match(store, TINY), clip).identities
+    keys = [unit.key for unit in plan_run(store, open_match(store, TINY), {})]
+    names = ("José Núñez", "#10 (goal)")  # no ids of a roster
+    for person, name in enumerate(names):
+        seen = find_sighting(found, person)
+        say(store, **{f"n{person}": NamedTrack(clip=clip, person=person, seen=seen, name=name)})
+    assert [unit.key for unit in plan_run(store, open_match(store, TINY), {})] == keys
+    run = Run(store, latest_run(store, TINY))
+    assert clip_positions(run, clip).names[:3] == [*names, ""]
+    assert origins_of(store, open_match(store, TINY), run.record)[f"tracking/{clip}"] == "automatic"
+    # A split that the run does not contain yet leaves its names; the pages show both.
+    middle = int(found.frame[len(found.frame) // 2])
+    say(store, split=SplitTrack(clip=clip, person=0, first_frame_of_new=middle))
+    new = int(found.person.max()) + 1
+    say(store, late=NamedTrack(clip=clip, person=new, name="late"))
+    assert names_of(run, clip) == dict(enumerate(names))
+    now = identities_now(store, open_match(store, TINY), clip).identities.names
+    assert now == {0: names[0], 1: names[1], new: "late"}
+    unit = planned(store)
+    compute(store, unit)
+    results = {**run.record.results, f"tracking/{clip}": unit.key}
+    after = Run(store, run.record.model_copy(update={"results": results}))
+    assert names_of(after, clip) == now
+    say(store, none=NamedTrack(clip=clip, person=0, name=None))
+    assert names_of(after, clip) == {1: names[1], new: "late"}
+    # Later iterations have no tracks without corrections.
+    store.withdraw(ResultId(TINY, "tracking", clip, run.record.results[f"tracking/{clip}"]))
+    assert names_of(after, clip) == {1: names[1], new: "late"}
+
+
+def test_a_name_whose_detection_is_gone_is_reported_until_it_is_given_again(store, project_copy):
+    found = identities_now(store, open_match(store, TINY), "clip").identities
+    one, other = found.person.tolist()[:2]
+    seen = find_sighting(found, one)
+    say(store, a=NamedTrack(clip="clip", person=one, seen=seen, name="Ann"))
+    run = Run(store, store.run(TINY))
+    assert lost_names(run) == {}
+    wrong = find_sighting(found, other)  # as after a run whose tracks have another detection there
+    say(store, b=NamedTrack(clip="clip", person=other, seen=wrong, name="Bea"))
+    journal = read_journal(store, TINY)
+    moved = journal.standing["b"].edit.model_copy(update={"seen": seen})
+    record = journal.standing["b"].model_copy(update={"id": "c", "edit": moved})
+    withdraw(store, open_match(store, TINY), ["b"], who="Ada", why="")
+    append(store, read_journal(store, TINY), [record])
+    (said,) = lost_names(run).values()
+    assert "'Bea' names no person" in said and names_of(run, "clip") == {one: "Ann"}
+    ada = page_client.log_in(page_client.served(project_copy), "Ada")
+    page = ada.get(MATCH).json()
+    (group,) = page["groups"]
+    assert (page["stale"], group["stale"]) == (1, 1)
+    (listed,) = succeed("review", "show", TINY, "--project", store.url, "--json").json["stale"]
+    assert (listed["id"], listed["reason"]) == ("c", said)
+    say(store, d=NamedTrack(clip="clip", person=other, seen=wrong, name="Bea"))
+    assert lost_names(run) == {}
+
+
+def state(store, people):
+    """Name people in match.yaml."""
+    registration = store.registration(TINY)
+    (clip,) = registration.spec.clips
+    named = clip.model_copy(update={"people": people})
+    roster = tuple(PlayerSpec(id=name) for name in people.values())
+    spec = registration.spec.model_copy(update={"clips": (named,), "roster": roster})
+    store.register(registration.model_copy(update={"spec": spec}))
+
+
+def test_names_of_the_match_folder_are_those_of_people_until_a_page_gives_others(store):
+    found = identities_now(store, open_match(store, TINY), "clip").identities
+    one, other = found.person.tolist()[:2]
+    state(store, {one: "ann", other: "bea", 99: "cleo"})
+    run = Run(store, store.run(TINY))
+    assert clip_positions(run, "clip").names[:2] == ["ann", "bea"]
+    (said,) = lost_names(run).values()
+    assert "'cleo' in match.yaml names no person: clip clip has no person 99" in said
+    assert objections_of(run) == {}  # of corrections alone
+    say(store, a=NamedTrack(clip="clip", person=one, name="Ann"))
+    say(store, b=NamedTrack(clip="clip", person=other, name=None))
+    assert names_of(run, "clip") == {one: "Ann"}
+    assert identities_now(store, open_match(store, TINY), "clip").identities.names[one] == "Ann"
+
+
+def test_every_door_refuses_what_does_not_fit_the_results(store):
+    refused = [
+        NamedTrack(clip="clip", person=77, name="p"),
+        DeletedDetection(camera="cam01", frame=5, detection=77),
+        DeletedDetection(camera="cam01", frame=5, detection=0, was=(1.0, 1.0, 20.0, 20.0)),
+    ]
+    match = open_match(store, TINY)
+    for edit in refused:
+        with pytest.raises(StaleEditError):
+            correct(store, match, [edit], who="Ada", why="")
+        with pytest.raises(StaleEditError):
+            say(store, a=edit)
+    assert read_journal(store, TINY).entries == ()
+
+
+@pytest.mark.slow
+def test_what_a_run_refused_is_told_so_and_what_no_run_has_yet(store, tmp_path):
+    edits = {
+        "out": DeletedDetection(camera="cam01", frame=5, detection=77),
+        "one": MergedTracks(clip="clip", kept=0, merged=88),
+    }
+    based = {"match_id": TINY, "who": "Ada", "based_on": {}}
+    made = [
+        Correction(id=name, edit=edit, made_at=datetime.now(UTC), **based)
+        for name, edit in edits.items()
+    ]
+    append(store, read_journal(store, TINY), made)  # as an older version kept them
+
+    def compute_units(stage, units):
+        for unit in units:
+            if not unit.published:
+                task = getattr(import_module(stage.task_module), stage.name)
+                task.fn(unit.work(store.url, open_match(store, TINY), "0002"))
+                yield unit, None
+
+    match, until = open_match(store, TINY), selected_stages(None, "tracking")
+    record = RunLog.begin(store, match, until, {}).run_stages(compute_units)
+    told = objections_of(Run(store, record))
+    # As after a garbage collection.
+    plain = ResultId(TINY, "ingest", "cam01", store.run(TINY, "0001").results["ingest/cam01"])
+    (store.blobs.root / plain.path).rename(tmp_path / "plain")
+    found = objections_of(Run(store, record))
+    (tmp_path / "plain").rename(store.blobs.root / plain.path)
+    assert found == told
+    assert "there is no detection 77" in found["out"] and "no person 88" in found["one"]
+    assert not {"corrected"} & {*origins_of(store, open_match(store, TINY), record).values()}
+    deleted = DeletedDetection(camera="cam01", frame=5, detection=0)
+    say(store, later=deleted)
+    shown = succeed("review", "show", TINY, "--project", store.url).out
+    assert "does not apply: there is no detection 77" in shown
+    assert "not in a run yet" in shown and "corrected" not in shown and "  applied" not in shown
+    # Made again, it is in the results of before; a name is in none, and counts at once.
+    say(store, name=NamedTrack(clip="clip", person=0, name="Bo"))
+    withdraw(store, open_match(store, TINY), ["later", "out", "one"], who="Ada", why="")
+    say(store, again=deleted)
+    RunLog.begin(store, open_match(store, TINY), until[:1], {}).run_stages(compute_units)
+    withdraw(store, open_match(store, TINY), ["again"], who="Ada", why="")
+    say(store, third=deleted)
+    shown = succeed("review", "show", TINY, "--project", store.url, "--json").json
+    states = {each["id"]: each["state"] for each in shown["corrections"]}
+    assert states == {"third": "applied", "name": "applied"}
+    assert shown["origins"]["ingest/cam01"] == "corrected"
+    click = open_match(store, TINY).folder.clicked["cam02"].points[0].name
+    say(store, click=MovedPoint(camera="cam02", marking=click, xy=None))
+    shown = succeed("review", "show", TINY, "--project", store.url).out
+    assert shown.count("  applied") == 2 and shown.count("not in a run yet") == 1

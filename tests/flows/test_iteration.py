@@ -1,26 +1,36 @@
-"""The method again and again: which units an edit reaches, which iteration stands, and why."""
+"""The method again and again: what an edit reaches, what is fitted again, which one stands."""
 
 import json
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 from command_line import succeed
+from filmed import write_filmed
 from run_records import run_record
-from test_refitting import halves
+from stand_ins import publish_stand_in
 
 from data_contracts.review import DeletedDetection
 from flows import iterate
+from flows.gates import Gatekeeper
 from flows.iterate import iterate_match
+from flows.match import task_of
 from flows.method import METHOD
-from flows.registering import register
+from flows.registering import open_match, register
 from flows.review.verdicts import correct
-from flows.run_plan import plan_run
+from flows.run_plan import RunPlan, plan_run
+from flows.run_record import RunLog, latest_run
 from flows.running import RunRequest
-from worldpose.errors import UsageError
+from flows.settings import parse_overrides, selected_stages
+from flows.stages.body_fitting import REFITTING
+from flows.stages.filtering import REDETECTION
+from worldpose.errors import InputError, UsageError
 from worldpose.formats.release_cameras import read_camera
 from worldpose.store.store import Store, open_run
 
+OTHER = {"tracking": {"min_joints": 6}}
 LATER = ("tracking", "triangulation", "bundle_adjustment", "retriangulation", "body_fitting")
 """Stages that from the second iteration on look at what was filtered."""
 
@@ -272,3 +282,165 @@ def test_who_was_missed_is_found_again_where_the_bodies_are(server, tmp_path):
     assert succeed(*asked, "--json").json["executed"] == 0
     status = succeed("status", "--project", project, "--json").json["matches"][0]["units"]
     assert not status["stale"] and not status["missing"]
+
+
+def halves(tiny, folder, **people):
+    """The match `tiny` with given cameras and two clips, in which people are named."""
+    if not folder.exists():
+        shutil.copytree(tiny, folder)
+        shutil.copy(folder / "reference" / "calibration.toml", folder)
+    spec = yaml.safe_load((folder / "match.yaml").read_text())
+    spec["match_id"] = "halves"
+    spec["roster"] = [{"id": name} for name in ("ann", "bea", "cleo")]
+    spec["clips"] = [
+        {"id": "first", "frame_count": 15},
+        {"id": "second", "first_frame": 15, "frame_count": 15},
+    ]
+    for clip in spec["clips"]:
+        clip["people"] = people.get(clip["id"], {})
+    (folder / "match.yaml").write_text(yaml.safe_dump(spec))
+    (folder / "detections" / "clip.npz").unlink(missing_ok=True)
+    return folder
+
+
+def test_a_match_without_calibrated_broadcast_or_names_has_nothing_to_refit(tiny, tmp_path):
+    store = Store.create(tmp_path / "project")
+    match, _ = register(store, tiny)
+    assert REFITTING.units(match) == ()
+    named = halves(tiny, tmp_path / "match", first={0: "ann"}, second={1: "bea"})
+    assert REFITTING.units(register(store, named)[0]) == ()
+
+
+def test_clips_with_the_same_person_are_fitted_again_with_each_others_shapes(tiny, tmp_path):
+    folder = halves(tiny, tmp_path / "match", first={0: "ann", 2: "bea"}, second={1: "ann"})
+    match, _ = register(Store.create(tmp_path / "project"), folder)
+    assert REFITTING.units(match) == ("first", "second")
+    assert "body_fitting/second" in REFITTING.inputs(match, "first")
+    assert REFITTING.sources(match, "first")["people"] == {
+        "first": {"0": "ann"},  # a name that no other clip has changes no shape
+        "second": {"1": "ann"},
+    }
+    # Only namesakes of the clip itself matter: another name there makes nothing stale.
+    assert REFITTING.sources(match, "second")["people"]["first"] == {"0": "ann"}
+
+
+def test_names_beyond_the_roster_are_refused(tiny, tmp_path):
+    folder = halves(tiny, tmp_path / "match", first={0: "nobody"})
+    with pytest.raises(InputError, match="nobody"):
+        register(Store.create(tmp_path / "project"), folder)
+
+
+@pytest.mark.slow
+def test_shapes_of_a_named_person_are_pooled_over_clips(tiny, tmp_path):
+    folder = halves(tiny, tmp_path / "match")
+    store = Store.create(tmp_path / "project")
+    match, _ = register(store, folder)
+
+    def compute():
+        opened = open_match(store, match.match_id)
+        for stage in METHOD:
+            for unit in plan_run(store, opened, {}):
+                if unit.recipe.stage == stage.name and not unit.published:
+                    task_of(stage).fn(unit.work(store.url, opened, "0001"))
+        return {
+            unit.name: store.open_result(
+                match.match_id, unit.recipe.stage, unit.recipe.unit, unit.key
+            )
+            for unit in plan_run(store, opened, {})
+        }
+
+    results = compute()
+    before, after = (results[f"body_fitting/{clip}"] for clip in ("first", "second"))
+    away = np.linalg.norm(
+        before["joints"].values[-1, :, None, 5:] - after["joints"].values[0, None, :, 5:], axis=-1
+    ).mean(axis=-1)
+    one, two = np.unravel_index(int(np.nanargmin(away)), away.shape)
+    named = [int(before["person"].values[one]), int(after["person"].values[two])]
+    halves(tiny, folder, first={named[0]: "ann"}, second={named[1]: "ann"})
+    again = compute()["refitting/first"]
+    np.testing.assert_array_equal(np.flatnonzero(again["pooled"].values), [one])
+    own, pooled = (np.trace(x["betas_covariance"].values[one]) for x in (before, again))
+    # Another clip as long, with the detector's offsets in common.
+    assert 0.3 * own < pooled < 0.95 * own
+
+
+@pytest.fixture
+def filmed(tmp_path):
+    """A folder with two clips of two cameras' videos."""
+    folder = tmp_path / "match"
+    greys = {"left": [0] * 12, "right": [10] * 12}
+    write_filmed(folder, greys, [("first", 0, 5), ("second", 6, 5)])
+    return Store.create(tmp_path / "project"), folder
+
+
+def test_detections_stay_and_all_later_stages_are_made_from_those_found_again(filmed):
+    store, folder = filmed
+    units = keys(store, folder, 3)
+    assert not any(name.startswith("redetection") for number, name in units if number == 1)
+    for (number, name), unit in units.items():
+        if number == 1:
+            continue
+        stage, _, which = name.partition("/")
+        if stage == "detection":
+            assert unit.key == units[1, name].key
+        if stage == "redetection":
+            clip = which.partition(".")[2]
+            assert unit.recipe.inputs[f"detection/{which}"] == units[1, f"detection/{which}"].key
+            for before in (f"filtering/{clip}", f"body_fitting/{clip}", f"tracking/{clip}"):
+                assert unit.recipe.inputs[before] == units[number - 1, before].key
+        if stage in (*LATER, "filtering"):
+            mine = {each for each in unit.recipe.inputs if each.startswith("redetection/")}
+            clips = ("first", "second") if which == "cameras" else (which,)
+            wanted = {f"redetection/{cam}.{clip}" for cam in ("left", "right") for clip in clips}
+            assert mine == wanted
+            assert all(unit.recipe.inputs[each] == units[number, each].key for each in mine)
+
+
+def test_of_given_poses_nobody_is_looked_for(tiny, tmp_path):
+    match, _ = register(Store.create(tmp_path / "project"), halves(tiny, tmp_path / "match"))
+    assert REDETECTION.units(match) == ()
+
+
+def run_passes(store, match, overrides, passes):
+    """Runs of so many passes over the method."""
+    stages = selected_stages(None, None)
+    for number in range(1, passes + 1):
+        for unit in plan_run(store, match, overrides, iteration=number):
+            if not unit.published:
+                publish_stand_in(store, match, unit)
+        log = RunLog.begin(store, match, stages, overrides, iteration=number)
+        for stage in stages:
+            log.reuse(log.plan.plan_stage(stage))
+        log.close()
+    return latest_run(store, match.match_id)
+
+
+@pytest.mark.parametrize("start", ["tracking", "body_fitting"])
+def test_a_later_stage_goes_on_with_the_pass_that_the_latest_run_was_made_of(clips, start):
+    store, folder = clips
+    match, _ = register(store, folder)
+    run_passes(store, match, {}, 2)
+    latest = run_passes(store, match, OTHER, 2)
+    stages = selected_stages(start, None)
+    asked = OTHER if start == "tracking" else {}
+    plan = RunPlan.begin(Gatekeeper(store, match, "never"), stages, asked, latest, 1)
+    assert plan.iteration == 2
+    first = {unit.name: unit.key for unit in plan_run(store, match, OTHER)}
+    assert plan.before["filtering/first"] == first["filtering/first"]
+    planned = plan.plan_stage(stages[0])
+    assert {unit.key for unit in planned} <= set(latest.results.values())
+    assert {unit.iteration for unit in planned} == {2}
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("detection.stride=true", "true"),
+        ("tracking.gate_m=true", "true"),
+        ("detection.zooms=[true, 2]", "[true, 2]"),
+    ],
+)
+def test_true_is_no_number(text, found):
+    with pytest.raises(UsageError, match="number") as refused:
+        parse_overrides([text])
+    assert refused.value.found == found

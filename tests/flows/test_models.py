@@ -10,11 +10,10 @@ import zipfile
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
-from typer.testing import CliRunner
+from command_line import invoke
 
 from data_contracts.checkpoint import Checkpoint
 from flows.checkpoint_downloads import pull, read_catalog, resolve_address
-from flows.cli.app import app
 from worldpose.detection.models import load_detectors, weights_of
 from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError, UsageError, WorldposeError
@@ -179,33 +178,29 @@ def test_only_safe_addresses_are_followed(hub, tmp_path):
         pull(checkpoint(), tmp_path, quiet)
 
 
-def run(*words):
-    return CliRunner().invoke(app, list(map(str, words)))
-
-
 def test_the_commands_list_pull_and_verify_checkpoints_of_a_users_file(hub, tmp_path, monkeypatch):
     folder, catalog = tmp_path / "cache", tmp_path / "mine.yaml"
     monkeypatch.setenv("WORLDPOSE_MODEL_FOLDER", str(folder))
     mine = single(f"{hub.url}/cdn/model.safetensors", NET).model_dump(exclude_none=True)
     catalog.write_text(json.dumps({"models": [mine]}))
-    listed = json.loads(run("models", "list", "--json", "--catalog", catalog).output)
+    listed = json.loads(invoke("models", "list", "--json", "--catalog", catalog).output)
     pulled = {row["name"]: row["pulled"] for row in listed["models"]}
     assert pulled == {**dict.fromkeys(CATALOG, False), "toy": False}
     with pytest.raises(InputError, match="worldpose models pull toy"):
         load_detectors(DetectionSettings(detector="model:toy"))
     assert not hub.asked  # nothing is downloaded unasked
-    answer = run("models", "pull", "toy", "--catalog", catalog)
+    answer = invoke("models", "pull", "toy", "--catalog", catalog)
     assert answer.exit_code == 0, answer.output
     assert "--set detection.detector=model:toy" in answer.output
-    listed = json.loads(run("models", "list", "--json").output)
+    listed = json.loads(invoke("models", "list", "--json").output)
     assert {row["name"] for row in listed["models"] if row["pulled"]} == {"toy"}
-    assert json.loads(run("models", "verify", "--json").output)["right"] == ["toy"]
+    assert json.loads(invoke("models", "verify", "--json").output)["right"] == ["toy"]
     (folder / "toy" / "files" / "model.onnx").write_bytes(NET[:-1])
-    answer = run("models", "verify", "toy")
+    answer = invoke("models", "verify", "toy")
     assert isinstance(answer.exception, WorldposeError)
     assert "toy: model.onnx" in str(answer.exception)
     assert not (folder / "toy").exists()
-    answer = run("models", "pull", "yolox-smal")
+    answer = invoke("models", "pull", "yolox-smal")
     assert "Did you mean 'yolox-s'" in str(answer.exception)
 
 

@@ -104,12 +104,8 @@ def test_a_damaged_input_fails_its_unit_and_repair_mends_it(server, tiny, tmp_pa
     assert lost["state"] == "missing"
     status = succeed("status", "--project", project, "--json").json["matches"][0]["units"]
     assert status["missing"] == [
-        "tracking/clip",
-        "triangulation/clip",
-        "bundle_adjustment/cameras",
-        "retriangulation/clip",
-        "body_fitting/clip",
-        "filtering/clip",
+        *("tracking/clip", "triangulation/clip", "bundle_adjustment/cameras"),
+        *("retriangulation/clip", "body_fitting/clip", "filtering/clip"),
     ]
     again = succeed("run", tiny, "--project", project, *joints, "--json").json
     assert (again["executed"], again["failed"]) == (2, 0)

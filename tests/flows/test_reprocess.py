@@ -5,14 +5,12 @@ from contextlib import contextmanager
 from types import SimpleNamespace
 
 import pytest
-from command_line import TINY, succeed
-from test_refitting import halves
-from typer.testing import CliRunner
+from command_line import TINY, invoke, succeed
+from test_iteration import halves
 
 from data_contracts.review import DeletedDetection, MergedTracks, MovedPoint
 from data_contracts.run import UnitFailure
 from flows import reprocess, run_plan
-from flows.cli.app import app
 from flows.cli.run import exit_code
 from flows.layers import PROJECT, write_layer
 from flows.method import METHOD
@@ -121,7 +119,7 @@ def test_what_failed_is_tried_again_when_something_is_another(store, error, agai
     told = f"run {TINY}/0002 failed with the same input and settings: x"
     assert explain_unit(store, f"{TINY}/tracking/clip", {})["reasons"] == (told,)
     if not again:
-        said = CliRunner().invoke(app, ["reprocess", "--project", store.url]).stdout
+        said = invoke("reprocess", "--project", store.url).stdout
         assert "nothing was edited since run 0002, which is failed; --retry" in " ".join(
             said.split()
         )
@@ -243,7 +241,7 @@ def test_the_exit_code_says_how_far_it_came():
 
 def test_the_command_lists_what_it_would_compute_and_why(store):
     edit_box(store)
-    answer = CliRunner().invoke(app, ["reprocess", "--dry-run", "--project", store.url])
+    answer = invoke("reprocess", "--dry-run", "--project", store.url)
     assert answer.exit_code == 0
     assert f"{TINY}: stale, run 0001; 8 units to compute" in answer.stdout
     assert "changed inputs: ingest/cam01" in " ".join(answer.stdout.split())
@@ -272,7 +270,5 @@ def test_reprocessing_computes_what_was_listed(server, store):
 def test_a_match_whose_weights_are_gone_is_a_problem_of_its_own(store, tmp_path):
     gone = tmp_path / "gone.onnx"
     write_layer(store, PROJECT, {"detection.pose": f"onnx:{gone}"})
-    status = json.loads(
-        CliRunner().invoke(app, ["status", "--project", store.url, "--json"]).stdout
-    )
+    status = json.loads(invoke("status", "--project", store.url, "--json").stdout)
     assert str(gone) in json.dumps(status)

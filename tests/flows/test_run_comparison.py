@@ -5,13 +5,11 @@ import json
 import numpy as np
 import pytest
 from camera_builders import plain_camera
-from command_line import TINY
+from command_line import TINY, invoke
 from run_records import correction, match_spec, run_record
-from typer.testing import CliRunner
 
 from data_contracts.match import Registration, SourceFile
 from data_contracts.review import DeletedDetection, MovedPoint
-from flows.cli.app import app
 from flows.results import comparison
 from flows.results.comparison import BodiesOfBoth, SubjectChange, compare_runs, pair_people
 from flows.review.verdicts import unit_origins
@@ -119,8 +117,7 @@ def command(project_copy):
     """The command line in this process, on a project with one finished run."""
 
     def run(*arguments):
-        asked = [*arguments, "--project", str(project_copy)]
-        answer = CliRunner().invoke(app, asked, catch_exceptions=True)
+        answer = invoke(*arguments, "--project", project_copy)
         if answer.exception is not None and not isinstance(answer.exception, SystemExit):
             raise answer.exception
         return answer

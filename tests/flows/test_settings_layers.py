@@ -11,13 +11,11 @@ from types import SimpleNamespace
 
 import pytest
 import yaml
-from command_line import TINY
-from typer.testing import CliRunner
+from command_line import TINY, invoke
 
 from flows import layers, reprocess
 from flows.cli import run as run_command
 from flows.cli import settings as cli_settings
-from flows.cli.app import app as worldpose
 from flows.layers import known_pitch, project_layers, read_layer, write_layer
 from flows.progress import reporting_to
 from flows.registering import open_match, register
@@ -40,7 +38,7 @@ BODY = "smpl-test"
 
 
 def command(*arguments, code=0):
-    answer = CliRunner().invoke(worldpose, list(map(str, arguments)))
+    answer = invoke(*arguments)
     assert answer.exit_code == code, answer.output + repr(answer.exception)
     return answer.stdout
 
@@ -138,7 +136,7 @@ def test_every_door_computes_the_same_keys(store, smpl, tiny, keys_of_run, tmp_p
     monkeypatch.setattr(deployed.MatchRuns, "of_plan", lambda plan: runs)
 
     def by_command():
-        CliRunner().invoke(worldpose, ["run", TINY, "--project", store.url])
+        invoke("run", TINY, "--project", store.url)
 
     def by_page():
         app_context.Continuing(store).go_on(TINY)
@@ -366,7 +364,7 @@ def test_a_stray_file_among_the_venues_closes_no_door(tmp_path):
     found = page()
     assert [each["layer"] for each in found["layers"]] == ["project", "venues/hall"]
     assert "settings/venues/Köln Arena.yaml is not used: " in found["problem"]
-    answer = CliRunner().invoke(worldpose, ["settings", "--project", store.url])
+    answer = invoke("settings", "--project", store.url)
     assert (answer.exit_code, found["problem"] in answer.stderr) == (0, True)
 
 

@@ -68,11 +68,7 @@ def test_a_healthy_run_is_usable_and_adjusted_cameras_replace_those_before():
         ("static_calibration/cam1", {"clicks_wrong": 5.0}, r"clicks of cam1 contradict .*: 5\. C"),
         (
             "static_calibration/cam1",
-            {
-                "clicks_wrong": 2.0,
-                "wrong_click.at_-52.50_0.04.again": 1.0,
-                "wrong_click.b_l": 1.0,
-            },
+            {"clicks_wrong": 2.0, "wrong_click.at_-52.50_0.04.again": 1.0, "wrong_click.b_l": 1.0},
             r"cam1 contradict .*: 2 \(\(-52\.5, 0\) m, once more, b l\)\. Correct",
         ),
         ("broadcast_tracking/clip", PLANE, r"places of people .* 9 m \(limit 1 m\)"),

@@ -143,10 +143,7 @@ def test_channels_of_a_file_get_a_test_alert_by_a_command(mail_server, webhook, 
     command = ("serve", "--test-alerts", "--project", tmp_path)
     answer = worldpose(*command)
     accepted, failed, mailed = answer.out.splitlines()
-    assert (accepted, mailed) == (
-        "webhook: accepted a test alert",
-        "mail: accepted a test alert",
-    )
+    assert (accepted, mailed) == ("webhook: accepted a test alert", "mail: accepted a test alert")
     assert answer.code == 1 and failed.startswith("json: failed: A Connection error")
     ((_, posted),) = webhook.posted
     assert posted["alert"] == "test" and "arrive here" in posted["text"]

@@ -70,8 +70,7 @@ def test_a_match_in_the_inbox_becomes_a_result_with_one_command(served, webhook,
     given = {"match_id": name, "name": "v1", "licence": "for tests"}
     begun = served.ask(f"/deployments/{deployment}/create_flow_run", {"parameters": given})
     wait_until(
-        lambda: served.ask(f"/flow_runs/{begun['id']}")["state_name"] == "Completed",
-        served.explain,
+        lambda: served.ask(f"/flow_runs/{begun['id']}")["state_name"] == "Completed", served.explain
     )
     released = served.project / "releases" / name
     assert json.loads((released / "v1" / "manifest.json").read_text())["release"] == "v1"

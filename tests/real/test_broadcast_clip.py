@@ -5,22 +5,13 @@ and with `static_pair`, which moving cameras are cut out of.
 """
 
 import csv
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import succeed
+from real_data import GIVEN, needs
 
-GIVEN = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent"))
 DATA = GIVEN / "broadcast_clip"
-
-needs_clip = pytest.mark.skipif(
-    not DATA.is_dir(), reason="WORLDPOSE_TEST_DATA has no broadcast_clip"
-)
-needs_pair = pytest.mark.skipif(
-    not (GIVEN / "static_pair").is_dir(), reason="WORLDPOSE_TEST_DATA has no static_pair"
-)
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +26,7 @@ def found(bench):
     return bench.calibrate(DATA)
 
 
-@needs_clip
+@needs("broadcast_clip")
 @pytest.mark.parametrize("name", ["drawn_first.json", "drawn_second.json"])
 def test_lines_drawn_by_hand_in_further_frames_are_met_within_a_pixel(bench, found, name):
     drawn = bench.read_drawn(name)
@@ -50,7 +41,7 @@ def test_lines_drawn_by_hand_in_further_frames_are_met_within_a_pixel(bench, fou
     assert np.mean([abs(row[2]) for row in nominal]) < 1.0  # seen: 0.64
 
 
-@needs_clip
+@needs("broadcast_clip")
 def test_the_stated_error_covers_the_lines_that_miss(bench, found):
     rows = bench.distances(found, bench.estimated_pitch(found), bench.read_drawn(bench.FIRST))
     off, stated = (np.array([row[column] for row in rows]) for column in (2, 3))
@@ -63,7 +54,7 @@ def test_the_stated_error_covers_the_lines_that_miss(bench, found):
 
 
 @pytest.mark.slow
-@needs_clip
+@needs("broadcast_clip")
 def test_the_clip_alone_gives_a_camera_and_people_on_the_pitch(bench, tmp_path):
     match, project = tmp_path / "match", ("--project", tmp_path / "project")
     match.mkdir()
@@ -81,7 +72,7 @@ def test_the_clip_alone_gives_a_camera_and_people_on_the_pitch(bench, tmp_path):
 
 
 @pytest.mark.slow
-@needs_pair
+@needs("static_pair")
 def test_a_low_camera_with_a_short_lens_over_a_pitch_that_falls_to_its_ends(bench, tmp_path):
     """A camera 8 m up, unlike those of large stadiums that the prior has, on a club's pitch."""
     true = bench.cut_clip.write_moving_clip(GIVEN / "static_pair", "right", "both", tmp_path)

@@ -3,22 +3,15 @@
 WORLDPOSE_TEST_DATA names a folder with `wc14` (lines.json, calib_eval.py).
 """
 
-import os
-from pathlib import Path
-
 import numpy as np
-import pytest
 from line_sets import SIZE, cameras_of_key_frames, jaccards, key_frame_lines, load_scorer
+from real_data import GIVEN, needs
 
-DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent"))
-
-pytestmark = pytest.mark.skipif(
-    not (DATA / "wc14").is_dir(), reason="WORLDPOSE_TEST_DATA has no wc14"
-)
+pytestmark = needs("wc14")
 
 
 def test_one_drawn_frame_gives_a_main_camera_in_a_main_stand():
-    lines = key_frame_lines(DATA)
+    lines = key_frame_lines(GIVEN)
     found = cameras_of_key_frames(lines)
     assert len(found) == len(lines)
     centers = np.array([camera.center for camera in found.values()])
@@ -26,7 +19,7 @@ def test_one_drawn_frame_gives_a_main_camera_in_a_main_stand():
     # Where main cameras stand; seen: 63 to 95 m, and 13 to 19 m high.
     assert ((away > 50.0) & (away < 120.0)).all()
     assert ((centers[:, 2] > 8.0) & (centers[:, 2] < 40.0)).all()
-    scorer = load_scorer(DATA)
+    scorer = load_scorer(GIVEN)
     hits = [jaccards(scorer, lines[name], camera, SIZE) for name, camera in found.items()]
     # Seen: 97.2, 98.3, 98.3; one marking of the 30 line sets' is 0.5.
     assert (100.0 * np.mean(hits, axis=0) >= (95.8, 97.8, 97.8)).all()

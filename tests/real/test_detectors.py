@@ -3,23 +3,16 @@
 WORLDPOSE_TEST_DATA names a folder with `static_pair` and `weights`.
 """
 
-import os
-from pathlib import Path
-
 import cv2
 import numpy as np
-import pytest
+from real_data import GIVEN, needs
 
 from worldpose.detection.onnx_detectors import load_onnx_detector
 from worldpose.detection.views import TiledDetector
 
-DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent"))
-NET = DATA / "weights" / "yolox_nano.onnx"
-VIDEO = DATA / "static_pair" / "left_camera.mp4"
+NET, VIDEO = "weights/yolox_nano.onnx", "static_pair/left_camera.mp4"
 
-pytestmark = pytest.mark.skipif(
-    not (NET.is_file() and VIDEO.is_file()), reason="WORLDPOSE_TEST_DATA has no weights or video"
-)
+pytestmark = needs(NET, VIDEO)
 
 PLAYERS = np.array(
     [
@@ -32,9 +25,9 @@ PLAYERS = np.array(
 
 
 def test_a_yolox_file_finds_the_players_of_a_real_frame():
-    shown, image = cv2.VideoCapture(str(VIDEO)).read()
+    shown, image = cv2.VideoCapture(str(GIVEN / VIDEO)).read()
     assert shown
-    detector = TiledDetector(load_onnx_detector(NET), (1.0,), 0.25, 0.7)
+    detector = TiledDetector(load_onnx_detector(GIVEN / NET), (1.0,), 0.25, 0.7)
     (found,) = detector.detect([np.ascontiguousarray(image[..., ::-1])])
     boxes = found.boxes[found.scores >= 0.4]
     inside = (boxes[:, None, :2] < PLAYERS) & (boxes[:, None, 2:] > PLAYERS)

@@ -4,31 +4,24 @@ WORLDPOSE_TEST_DATA names a folder with `mvor/camma_mvor_2018.json` and `mvor/op
 the repository CAMMA-public/MVOR (CC BY-NC-SA 4.0).
 """
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 from mvor import load_moments, measure
+from real_data import GIVEN, needs
 
 from worldpose.tracking.settings import TrackingSettings
 
-MVOR = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent")) / "mvor"
-FILES = [MVOR / "camma_mvor_2018.json", MVOR / "openpose_kps.json"]
-
-needs_data = pytest.mark.skipif(
-    not all(file.is_file() for file in FILES), reason="WORLDPOSE_TEST_DATA has no mvor"
-)
+FILES = ("mvor/camma_mvor_2018.json", "mvor/openpose_kps.json")
 
 
 @pytest.fixture(scope="module")
 def measured():
     """The benchmark's results with default settings: errors [cm] and people, by views."""
-    return measure(*load_moments(MVOR), TrackingSettings())
+    return measure(*load_moments(GIVEN / "mvor"), TrackingSettings())
 
 
 # Published errors of mv3dreg are 9.9 and 18.3 cm; seen here 308 of 308 at 9.2, 356 of 415 at 11.8.
-@needs_data
+@needs(*FILES)
 @pytest.mark.parametrize(("views", "share", "limit_cm"), [(3, 0.95, 9.9), (2, 0.85, 13.0)])
 def test_people_of_an_operating_room_are_found(measured, views, share, limit_cm):
     errors = np.array(measured["errors"][views])

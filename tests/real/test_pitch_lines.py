@@ -4,19 +4,12 @@ WORLDPOSE_TEST_DATA names a folder with `wc14` (lines.json, homographies.json, c
 `sn22_lines` (lines.json). Settings were chosen on the even half of each; the odd half is scored.
 """
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 from line_sets import BROADCAST, SETS, fit_all, jaccards, left_out, load_lines, load_scorer, overlap
+from real_data import GIVEN, needs
 
-DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent"))
-
-pytestmark = pytest.mark.skipif(
-    not (DATA / "wc14").is_dir() or not (DATA / "sn22_lines").is_dir(),
-    reason="WORLDPOSE_TEST_DATA has no wc14 and sn22_lines",
-)
+pytestmark = needs("wc14", "sn22_lines")
 
 
 @pytest.mark.parametrize(
@@ -29,9 +22,9 @@ pytestmark = pytest.mark.skipif(
     ],
 )
 def test_drawn_lines_give_cameras_that_hit_them(name, minimum):
-    scorer = load_scorer(DATA)
+    scorer = load_scorer(GIVEN)
     _, size = SETS[name]
-    lines = load_lines(DATA, name, half=1, every=1)
+    lines = load_lines(GIVEN, name, half=1, every=1)
     fits = fit_all(lines, size)
     assert len(fits) >= 0.988 * len(lines)
     scores = [
@@ -42,9 +35,9 @@ def test_drawn_lines_give_cameras_that_hit_them(name, minimum):
 
 @pytest.mark.slow
 def test_the_camera_of_the_other_markings_predicts_one():
-    lines = load_lines(DATA, "wc14", half=1, every=3)
+    lines = load_lines(GIVEN, "wc14", half=1, every=3)
     _, size = SETS["wc14"]
-    hits = left_out(load_scorer(DATA), lines, size, BROADCAST)
+    hits = left_out(load_scorer(GIVEN), lines, size, BROADCAST)
     # A third of the half, about 130 markings: two deviations of 3 % below the half's 84.1 and 92.6.
     assert hits[0] >= 78.0
     assert hits[1] >= 87.5
@@ -52,8 +45,8 @@ def test_the_camera_of_the_other_markings_predicts_one():
 
 @pytest.mark.slow
 def test_distortion_free_cameras_overlap_the_annotated_homographies():
-    lines = load_lines(DATA, "wc14", half=1, every=1)
+    lines = load_lines(GIVEN, "wc14", half=1, every=1)
     _, size = SETS["wc14"]
-    mean, _ = overlap(load_scorer(DATA), DATA, lines, size)
+    mean, _ = overlap(load_scorer(GIVEN), GIVEN, lines, size)
     # Seen: 97.1.
     assert mean >= 96.5

@@ -3,13 +3,12 @@
 WORLDPOSE_TEST_DATA names a folder as benchmarks/real.py describes it.
 """
 
-import os
 import sys
 from pathlib import Path
 
 import pytest
+from real_data import GIVEN, needs
 
-REAL = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent"))
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 
 
@@ -44,10 +43,10 @@ def test_bad_data_is_one_clear_error(table, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not (REAL / "static_pair").is_dir(), reason="WORLDPOSE_TEST_DATA is not set")
+@needs("static_pair")
 def test_a_few_frames_of_the_real_folder_give_metrics(table):
     failure, out = table(
-        REAL, "--only", "static_pair", "--only", "panorama_people", *("--frames", 3)
+        GIVEN, "--only", "static_pair", "--only", "panorama_people", *("--frames", 3)
     )
     assert failure is None
     assert "| static_pair | left.wrong_named | 3 |" in out

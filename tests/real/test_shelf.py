@@ -5,19 +5,18 @@ WORLDPOSE_TEST_DATA names a folder with `shelf_dev/import` (calibration.toml, de
 """
 
 import importlib.util
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import succeed
+from real_data import GIVEN, needs
 
 from worldpose.formats.joints_file import read_joints
 
-SHELF = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent")) / "shelf_dev"
+SHELF = GIVEN / "shelf_dev"
 
 pytestmark = [
-    pytest.mark.skipif(not SHELF.is_dir(), reason="WORLDPOSE_TEST_DATA has no shelf_dev"),
+    needs("shelf_dev"),
     pytest.mark.usefixtures("server"),
     pytest.mark.slow,  # 60 of its frames are in test_shelf_cameras.py
 ]

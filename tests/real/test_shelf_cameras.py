@@ -3,21 +3,18 @@
 WORLDPOSE_TEST_DATA names a folder with `shelf_dev`, as `test_shelf.py` says.
 """
 
-import os
-from pathlib import Path
-
 import numpy as np
-import pytest
 from common import load_module, run_in_process
+from real_data import GIVEN, needs
 from shelf import open_keys, score, write_case
 
 from worldpose.store.store import Store
 
-SHELF = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent")) / "shelf_dev"
+SHELF = GIVEN / "shelf_dev"
 CAMERAS = ("cam0", "cam2", "cam3", "cam4")
 FRAMES = range(421, 481)
 
-pytestmark = pytest.mark.skipif(not SHELF.is_dir(), reason="WORLDPOSE_TEST_DATA has no shelf_dev")
+pytestmark = needs("shelf_dev")
 
 
 def test_adjustment_of_four_given_cameras_harms_no_joints(tmp_path):

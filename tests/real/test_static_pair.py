@@ -4,13 +4,12 @@ WORLDPOSE_TEST_DATA names a folder with `static_pair` (videos and CVAT clicks).
 """
 
 import csv
-import os
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import succeed, worldpose
+from real_data import GIVEN, needs
 from static_pair import CROWN, read_clicks, write_static_pair
 
 from data_contracts.pitch import PitchSpec
@@ -19,9 +18,9 @@ from worldpose.errors import InputError
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.estimate import calibrate_camera
 
-DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent")) / "static_pair"
+DATA = GIVEN / "static_pair"
 
-pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="WORLDPOSE_TEST_DATA has no static_pair")
+pytestmark = needs("static_pair")
 
 
 def calibrated(side, *, correct_labels):

@@ -1,6 +1,5 @@
 """Labels of real stills, and cameras that are calibrated from them without a click."""
 
-import os
 import sys
 from pathlib import Path
 
@@ -8,11 +7,12 @@ import cv2
 import numpy as np
 import pytest
 import stills
+from real_data import GIVEN, needs
 
 from worldpose.pitch.template import PitchTemplate
 from worldpose.training.labels import read_labels
 
-DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent")) / "still_cameras"
+DATA = GIVEN / "still_cameras"
 MIDFIELD, AREA = "che0", "var9"
 
 
@@ -38,7 +38,7 @@ def test_labels_name_markings_and_lie_in_their_images(bench):
         assert (pixels < np.array(still["size"]) + 1.0).all()
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="WORLDPOSE_TEST_DATA has no still_cameras")
+@needs("still_cameras")
 @pytest.mark.parametrize("name", [MIDFIELD, pytest.param(AREA, marks=pytest.mark.slow)])
 def test_a_real_still_is_calibrated_without_a_click(bench, name):
     (still,) = bench.read_labels(only=[name])

@@ -4,13 +4,12 @@ WORLDPOSE_TEST_DATA names a folder with `sskit`: the folder `example` of Spiideo
 """
 
 import json
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from real_data import GIVEN, needs
 
 from data_contracts.cameras import COEFFICIENTS, LensCalibration
 from data_contracts.pitch import PitchSpec
@@ -22,8 +21,8 @@ from worldpose.geometry.rigid import Rigid
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.from_paint.proposal import calibrate_proposal, propose_camera
 
-DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent")) / "sskit"
-pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="no still of Spiideo/sskit")
+DATA = GIVEN / "sskit"
+pytestmark = needs("sskit")
 SIZE = np.array([3840, 2160])
 # Their x is across the pitch, their y along it, towards what is left in the world of this project.
 WORLD = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

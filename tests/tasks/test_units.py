@@ -222,13 +222,8 @@ def test_units_behind_a_failed_one_are_recorded_as_blocked(planned):
     assert record.state == "failed"
     assert [failure.unit for failure in record.failed] == [failed]
     assert record.blocked == (
-        "body_fitting/clip",
-        "bundle_adjustment/cameras",
-        "camera_consistency/clip",
-        "filtering/clip",
-        "retriangulation/clip",
-        "tracking/clip",
-        "triangulation/clip",
+        *("body_fitting/clip", "bundle_adjustment/cameras", "camera_consistency/clip"),
+        *("filtering/clip", "retriangulation/clip", "tracking/clip", "triangulation/clip"),
     )
     # The other cameras have their results: only what needs all of them waits.
     assert len(record.executed) == len(plan_run(store, match, {})) - 8

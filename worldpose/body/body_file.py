@@ -31,13 +31,7 @@ NARROW_OPEN_BODY: Final = "open-neutral/3"
 """The open body with hip joints as far apart as people's; its surface is the same."""
 
 KEYS: Final = (
-    "v_template",
-    "shapedirs",
-    "posedirs",
-    "J_regressor",
-    "weights",
-    "kintree_table",
-    "f",
+    *("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f"),
 )
 """Names of a model's arrays in SMPL's files."""
 

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.conventions import COCO17
+from data_contracts.conventions import COCO17, FEET
 from worldpose.body.model import JOINTS, SMPL_VERTICES, BodyModel, BodyParameters
 from worldpose.errors import InputError
 
@@ -48,26 +48,15 @@ JOINT_OF_POINT: Final = MappingProxyType(
 _LANDMARK_PAIRS: Final = {
     "head": ((20, 21), (58, 57), (1299, 1301), (1376, 1362)),
     "trunk": (
-        (2016, 2015),
-        (2190, 2189),
-        (2337, 2338),
-        (2721, 2722),
-        (2894, 2895),
-        (2977, 2976),
-        (3603, 3604),
-        (3795, 3794),
+        *((2016, 2015), (2190, 2189), (2337, 2338), (2721, 2722)),
+        *((2894, 2895), (2977, 2976), (3603, 3604), (3795, 3794)),
     ),
     "pelvis": ((4757, 4758), (4765, 4766)),
     "upper_arm": ((2653, 2654), (2382, 2381), (2032, 2031)),
     "forearm": ((3421, 3420), (2854, 2853)),
     "thigh": (
-        (4840, 4839),
-        (4971, 4970),
-        (5006, 5007),
-        (5068, 5069),
-        (5114, 5115),
-        (5157, 5156),
-        (5287, 5286),
+        *((4840, 4839), (4971, 4970), (5006, 5007), (5068, 5069)),
+        *((5114, 5115), (5157, 5156), (5287, 5286)),
     ),
     "shank": ((5358, 5359), (5439, 5438), (5489, 5488), (5591, 5590)),
     "foot": ((6863, 6862), (6109, 6108)),
@@ -101,39 +90,15 @@ VERTEX_OF_POINT: Final = MappingProxyType(
 )
 
 BODY25: Final = (
-    "nose",
-    "neck",
-    "right_shoulder",
-    "right_elbow",
-    "right_wrist",
-    "left_shoulder",
-    "left_elbow",
-    "left_wrist",
-    "mid_hip",
-    "right_hip",
-    "right_knee",
-    "right_ankle",
-    "left_hip",
-    "left_knee",
-    "left_ankle",
-    "right_eye",
-    "left_eye",
-    "right_ear",
-    "left_ear",
-    "left_big_toe",
-    "left_small_toe",
-    "left_heel",
-    "right_big_toe",
-    "right_small_toe",
-    "right_heel",
+    *("nose", "neck", "right_shoulder", "right_elbow", "right_wrist"),
+    *("left_shoulder", "left_elbow", "left_wrist", "mid_hip"),
+    *("right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle"),
+    *("right_eye", "left_eye", "right_ear", "left_ear"),
+    *FEET,
 )
 """OpenPose's 25 points in its order."""
 
-HALPE26: Final = (
-    *COCO17,
-    *("head_top", "neck", "mid_hip"),
-    *_both("big_toe", "small_toe", "heel"),
-)
+HALPE26: Final = (*COCO17, *("head_top", "neck", "mid_hip"), *_both("big_toe", "small_toe", "heel"))
 """The 26 points of Halpe Full-Body in its order."""
 
 CHALLENGE15: Final = (

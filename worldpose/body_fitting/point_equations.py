@@ -32,12 +32,7 @@ def invert_symmetric(matrices: Floats) -> Floats:
 
 @compile_kernel
 def accumulate_points(
-    rows: Floats,
-    own: Floats,
-    next_frame: Floats,
-    second_frame: Floats,
-    force: Floats,
-    tied: bool,
+    rows: Floats, own: Floats, next_frame: Floats, second_frame: Floats, force: Floats, tied: bool
 ) -> tuple[Floats, Floats]:
     """Return the blocks (3, frames, 36, 36) and the gradient (frames, 36) of point terms.
 

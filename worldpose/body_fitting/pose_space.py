@@ -25,16 +25,9 @@ from worldpose.geometry.rigid import Rigid, cross, orthonormal_frame, unit
 from worldpose.parsing import read_npz_members
 
 COORDINATES: Final = (
-    ("spine1", "spine2", "spine3"),
-    ("neck", "head"),
-    ("left_hip",),
-    ("right_hip",),
-    ("left_knee",),
-    ("right_knee",),
-    ("left_shoulder",),
-    ("right_shoulder",),
-    ("left_elbow",),
-    ("right_elbow",),
+    *(("spine1", "spine2", "spine3"), ("neck", "head"), ("left_hip",), ("right_hip",)),
+    *(("left_knee",), ("right_knee",)),
+    *(("left_shoulder",), ("right_shoulder",), ("left_elbow",), ("right_elbow",)),
 )
 """Joints that share a rotation evenly; three coordinates each."""
 SIZE: Final = 3 * len(COORDINATES)

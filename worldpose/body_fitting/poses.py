@@ -20,12 +20,7 @@ from worldpose.body_fitting.evidence import (
 )
 from worldpose.body_fitting.monocular import MonocularPrior
 from worldpose.body_fitting.point_equations import propagate, propagate_alone
-from worldpose.body_fitting.pose_space import (
-    PosePrior,
-    interpolate_gaps,
-    level_feet,
-    start_poses,
-)
+from worldpose.body_fitting.pose_space import PosePrior, interpolate_gaps, level_feet, start_poses
 from worldpose.body_fitting.residuals import ACCELERATION_SCALE, PersonObjective, Pose
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.errors import DegenerateError

@@ -125,10 +125,7 @@ class FitMetrics:
 
 
 def report_fit(
-    fit: BodyFit,
-    joints: Floats,
-    fps: float,
-    seen: tuple[Camera, KeypointDetections] | None = None,
+    fit: BodyFit, joints: Floats, fps: float, seen: tuple[Camera, KeypointDetections] | None = None
 ) -> BodyFittingReport:
     """Return the metrics of a fit.
 

@@ -139,12 +139,7 @@ class PersonObjective:
     """First frames of the intervals after the first; motion ties no interval to another."""
 
     def equations(
-        self,
-        pose: Pose,
-        offsets: Floats,
-        *,
-        bordered: bool,
-        points: KeypointJacobian | None = None,
+        self, pose: Pose, offsets: Floats, *, bordered: bool, points: KeypointJacobian | None = None
     ) -> NormalEquations:
         """Return the normal equations at a pose: of all terms but E_shape and E_offset.
 

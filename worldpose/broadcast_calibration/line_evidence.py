@@ -214,9 +214,7 @@ def follow_lines(
         single = camera.frames(slice(frame, frame + 1))
         turn = after.rotation @ np.swapaxes(before.rotation, -1, -2)
         begin = replace(
-            single,
-            rotation=turn @ single.rotation,
-            focal=single.focal * after.focal / before.focal,
+            single, rotation=turn @ single.rotation, focal=single.focal * after.focal / before.focal
         )
         people = None if boxes is None else boxes[frame]
         found, corrected, seen = find_lines(begin, samples, picture, people, settings)

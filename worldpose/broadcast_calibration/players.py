@@ -171,10 +171,7 @@ def match(camera: MovingCamera, people: People) -> Matches:
 
 
 def player_evidence(
-    camera: MovingCamera,
-    people: People,
-    matches: Matches,
-    settings: BroadcastCalibrationSettings,
+    camera: MovingCamera, people: People, matches: Matches, settings: BroadcastCalibrationSettings
 ) -> tuple[PointEvidence, PlayerNoise]:
     """Return matched keypoints as evidence, and the estimated keypoint noise.
 

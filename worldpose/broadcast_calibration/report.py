@@ -11,12 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from data_contracts.arrays import Flags, Floats, Image, Integers
 from data_contracts.broadcast_calibration import FRAME_STATUS
-from worldpose.broadcast_calibration.evidence import (
-    MARKING,
-    PLAYER,
-    FlowEvidence,
-    PointEvidence,
-)
+from worldpose.broadcast_calibration.evidence import MARKING, PLAYER, FlowEvidence, PointEvidence
 from worldpose.broadcast_calibration.key_frames import Keys
 from worldpose.broadcast_calibration.learned_noise import Weights
 from worldpose.broadcast_calibration.moving_camera import MovingCamera

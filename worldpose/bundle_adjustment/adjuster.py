@@ -206,9 +206,7 @@ class Adjuster:
         factor = self.variance_factor[:, None, None]
         response = survey_response(self.clip, self.settings.survey_error_m)
         return add_shared_errors(
-            adjusted.camera_covariance,
-            information / factor,
-            np.sqrt(factor) * response,
+            adjusted.camera_covariance, information / factor, np.sqrt(factor) * response
         )
 
     def held_out_errors(self, fixed: Flags | None) -> HeldOutErrors:

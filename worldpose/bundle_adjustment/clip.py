@@ -234,10 +234,7 @@ def learn_confidence(clip: Clip, frames: Integers) -> Clip:
 
 
 def project_joints(
-    cameras: Camera,
-    joints: Floats,
-    confidence: Floats,
-    settings: TriangulationSettings,
+    cameras: Camera, joints: Floats, confidence: Floats, settings: TriangulationSettings
 ) -> tuple[Floats, Floats]:
     """Return projections of joints, and the standard deviation of keypoints there per axis [px].
 
@@ -267,11 +264,7 @@ def project_joints(
 
 
 def propose_frames(
-    clip: Clip,
-    count: int,
-    gap: float,
-    min_views: int,
-    taken: Integers | None = None,
+    clip: Clip, count: int, gap: float, min_views: int, taken: Integers | None = None
 ) -> Integers:
     """Return indices of the most informative frames for all cameras, ascending.
 

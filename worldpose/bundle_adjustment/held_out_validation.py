@@ -45,11 +45,7 @@ class HeldOutErrors:
 
 
 def held_out_errors(
-    clip: Clip,
-    cameras: Camera,
-    frames: Integers,
-    people: Flags,
-    robust_scale: float,
+    clip: Clip, cameras: Camera, frames: Integers, people: Flags, robust_scale: float
 ) -> HeldOutErrors:
     """Return the errors of held-out people's keypoints against joints from the other cameras.
 
@@ -206,10 +202,7 @@ class Contradictions:
 
 
 def find_contradictions(
-    clip: Clip,
-    frames: Integers,
-    held: HeldOutErrors,
-    settings: BundleAdjustmentSettings,
+    clip: Clip, frames: Integers, held: HeldOutErrors, settings: BundleAdjustmentSettings
 ) -> Contradictions:
     """Return the cameras that disagree with all others far beyond their stated errors.
 

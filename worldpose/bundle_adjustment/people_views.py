@@ -68,9 +68,7 @@ def find_walkers(
     every = []
     for c, name in enumerate(names):
         points = np.where(
-            (detections.confidence[:, c] > 0.3)[..., None],
-            detections.keypoints[:, c],
-            np.nan,
+            (detections.confidence[:, c] > 0.3)[..., None], detections.keypoints[:, c], np.nan
         ).astype(np.float64)[:, :, JOINTS]
         tracks = _track(points, fps)
         if not tracks:
@@ -253,11 +251,7 @@ class Views:
         if not people:
             return None
         count, rotation, way, _, space = cv2.recoverPose(
-            best[1],
-            np.concatenate(ones),
-            np.concatenate(others),
-            np.eye(3),
-            distanceThresh=1e3,
+            best[1], np.concatenate(ones), np.concatenate(others), np.eye(3), distanceThresh=1e3
         )
         pose = _rigid(rotation, way)
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -22,9 +22,7 @@ from worldpose.triangulation.estimate import triangulate_frames
 
 
 def adjustment_arrays(
-    adjusted: BundleAdjustment,
-    settings: BundleAdjustmentSettings,
-    person: NDArray[np.integer[Any]],
+    adjusted: BundleAdjustment, settings: BundleAdjustmentSettings, person: NDArray[np.integer[Any]]
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Return the stored arrays and attributes of adjusted cameras, without the people.
 
@@ -183,10 +181,7 @@ def _find_outliers(
 
 
 def review_clicks(
-    clicks: tuple[Clicks, ...],
-    cameras: Camera,
-    covariance: Floats,
-    changed: Flags,
+    clicks: tuple[Clicks, ...], cameras: Camera, covariance: Floats, changed: Flags
 ) -> ClickReview:
     """Return every clicked point's residual and its Mahalanobis distance.
 

@@ -10,11 +10,7 @@ from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
 from scipy.linalg.blas import dsyrk
 
 from data_contracts.arrays import Floats
-from worldpose.bundle_adjustment.residuals import (
-    AdjustmentProblem,
-    AdjustmentSolution,
-    prior_cost,
-)
+from worldpose.bundle_adjustment.residuals import AdjustmentProblem, AdjustmentSolution, prior_cost
 from worldpose.bundle_adjustment.settings import SolverSettings
 from worldpose.errors import InputError, InternalError
 from worldpose.geometry.camera_model import STEP

@@ -204,14 +204,8 @@ def _handedness(source: PointSource) -> float:
 
 def _feet(source: PointSource) -> Floats:
     """Return the height (frames, persons) [m] of every body's lowest foot above z = 0."""
-    foot_points = (
-        "left_big_toe",
-        "right_big_toe",
-        "left_heel",
-        "right_heel",
-        "left_ankle",
-        "right_ankle",
-    )
+    parts = ("big_toe", "heel", "ankle")
+    foot_points = [f"{side}_{part}" for part in parts for side in ("left", "right")]
     soles = [name for name in foot_points if name in source.skeleton]
     lift = 0.0
     # Height of an ankle above the ground if a skeleton has no sole [m].

@@ -154,8 +154,7 @@ def _find_poses(boxes: Floats) -> Steps:
     # A product of fit and surest keypoints from which a person is certain [1].
     min_certain_score = 0.25
     known = suppress(
-        People(seen[score >= min_certain_score], score[score >= min_certain_score]),
-        SAME_PERSON_IOU,
+        People(seen[score >= min_certain_score], score[score >= min_certain_score]), SAME_PERSON_IOU
     ).boxes
     shares = box_iou(asked, known)
     # A person that overlaps a neighbour more gets a second crop [1, intersection over union].

@@ -22,12 +22,7 @@ from data_contracts.arrays import Floats, Image
 from data_contracts.conventions import FEET
 from data_contracts.keypoints import KeypointDetections
 from worldpose.body.keypoints import LANDMARKS
-from worldpose.detection.bundled_nets import (
-    CELL,
-    Block,
-    Pyramid,
-    peaks,
-)
+from worldpose.detection.bundled_nets import CELL, Block, Pyramid, peaks
 from worldpose.detection.bundled_pose import SAME_PERSON_IOU
 from worldpose.detection.crops import MAP_COUNT
 from worldpose.detection.net_inference import CROPS, PlacedNet, QuantizedNet

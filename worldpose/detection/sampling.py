@@ -110,10 +110,7 @@ def pad(views: Sequence[View], shape: Sequence[int]) -> Frame:
 
 
 def sample_crops(
-    images: Sequence[Image],
-    boxes: Sequence[Floats],
-    others: Sequence[Floats],
-    device: str,
+    images: Sequence[Image], boxes: Sequence[Floats], others: Sequence[Floats], device: str
 ) -> tuple[Floats, Frame, Singles]:
     """Return a crop around each box of some frames, and maps of the boxes around it.
 

@@ -115,10 +115,7 @@ def _cut(image: Image, views: Sequence[ImageTile], size: tuple[int, int]) -> lis
     cut = []
     for view in views:
         if view.scale not in scaled:
-            target = (
-                round(image.shape[1] * view.scale),
-                round(image.shape[0] * view.scale),
-            )
+            target = (round(image.shape[1] * view.scale), round(image.shape[0] * view.scale))
             way = cv2.INTER_AREA if view.scale < 1.0 else cv2.INTER_LINEAR
             resized = image if view.scale == 1.0 else cv2.resize(image, target, None, 0, 0, way)
             scaled[view.scale] = np.asarray(resized, dtype=np.uint8)

@@ -33,10 +33,7 @@ class HeldOut:
 
 
 def measure_held_out(
-    cameras: Camera,
-    used: KeypointDetections,
-    detected: AnyFloats,
-    settings: TriangulationSettings,
+    cameras: Camera, used: KeypointDetections, detected: AnyFloats, settings: TriangulationSettings
 ) -> HeldOut | None:
     """Return the prediction error in held-out cameras; None without data.
 

@@ -33,12 +33,7 @@ def _capsules() -> tuple[NDArray[np.int64], Floats]:
     """Return pairs of joints at the ends of a body's solid parts, and their radii [m]."""
     left_shoulder, right_shoulder, left_hip, right_hip = COCO17_TORSO
     trunk = set(COCO17_TORSO)
-    ends = [
-        *COCO17_BONES,
-        (left_shoulder, right_hip),
-        (right_shoulder, left_hip),
-        (3, 4),
-    ]
+    ends = [*COCO17_BONES, (left_shoulder, right_hip), (right_shoulder, left_hip), (3, 4)]
     radius = [0.12 if a < 5 and b < 5 else 0.11 if {a, b} <= trunk else 0.06 for a, b in ends]
     return np.array(ends), np.array(radius)
 

@@ -106,12 +106,7 @@ def by_rotation(
 
 @inline_kernel
 def observe(
-    camera: CameraNumbers,
-    px: float,
-    py: float,
-    pz: float,
-    by_step: Floats,
-    by_point: Floats,
+    camera: CameraNumbers, px: float, py: float, pz: float, by_step: Floats, by_point: Floats
 ) -> tuple[int, float, float, float]:
     """Return status, pixel u, v [px] and depth [m] of a world point, and write derivatives.
 

@@ -133,10 +133,7 @@ def shape_energy(betas: Tensor) -> Tensor:
 
 
 def refine_energy(
-    body: DifferentiableBody,
-    omega: Omega,
-    cameras: TensorCameras,
-    aligned: Tensor,
+    body: DifferentiableBody, omega: Omega, cameras: TensorCameras, aligned: Tensor
 ) -> Tensor:
     """Return E_refine = lambda_1 E_data + lambda_2 E_smooth + lambda_3 E_shape."""
     weights = Weights()

@@ -203,10 +203,7 @@ def append(store: Store, journal: Journal, records: Sequence[ReviewRecord]) -> J
     """
     number = journal.last + 1
     entry = JournalEntry(
-        match_id=journal.match_id,
-        number=number,
-        previous=journal.tip,
-        records=tuple(records),
+        match_id=journal.match_id, number=number, previous=journal.tip, records=tuple(records)
     )
     if not store.blobs.put_new(_path(journal.match_id, number), seal(entry)):
         return None

@@ -24,14 +24,8 @@ from worldpose.errors import StoreError
 from worldpose.store.paths import STAGING, checked_path
 
 COMMIT_POINTS = (
-    "before_write",
-    "after_write",
-    "before_publish",
-    "during_publish",
-    "before_commit",
-    "after_commit",
-    "before_run_record",
-    "after_run_record",
+    *("before_write", "after_write", "before_publish", "during_publish", "before_commit"),
+    *("after_commit", "before_run_record", "after_run_record"),
 )
 """In execution order.
 

@@ -275,9 +275,7 @@ class PublishedFiles(Store):
         return data
 
     async def get_partial_values(
-        self,
-        prototype: BufferPrototype,
-        key_ranges: Iterable[tuple[str, ByteRequest | None]],
+        self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
     ) -> list[Buffer | None]:
         """Return ranges of several files."""
         return [await self.get(key, prototype, part) for key, part in key_ranges]

@@ -129,9 +129,7 @@ def _is_damaged(store: Store, result: ResultId) -> bool:
     return any(finding.result for finding in _check_result(store, result, entries))
 
 
-def _by_result(
-    entries: Iterable[Entry],
-) -> tuple[dict[ResultId, dict[str, Entry]], list[str]]:
+def _by_result(entries: Iterable[Entry]) -> tuple[dict[ResultId, dict[str, Entry]], list[str]]:
     groups: dict[ResultId, dict[str, Entry]] = {}
     strays = []
     for entry in entries:
@@ -197,10 +195,7 @@ def _check_document(
             case ["runs", match_id, name] if name.endswith(".open.json") and is_run_file(name):
                 is_record = True
                 reservation = unseal(Reservation, data, where)
-                fits = (match_id, name) == (
-                    reservation.match_id,
-                    f"{reservation.run_id}.open.json",
-                )
+                fits = (match_id, name) == (reservation.match_id, f"{reservation.run_id}.open.json")
             case ["runs", match_id, name] if is_run_file(name):
                 is_record = True
                 record = unseal(RunRecord, data, where)

@@ -24,13 +24,7 @@ def libraries() -> dict[str, str]:
         "store": STORE_FORMAT,
     }
     numeric_libraries = (
-        "numpy",
-        "scipy",
-        "numba",
-        "opencv-python-headless",
-        "av",
-        "zarr",
-        "numcodecs",
+        *("numpy", "scipy", "numba", "opencv-python-headless", "av", "zarr", "numcodecs"),
     )
     for name in numeric_libraries:
         try:

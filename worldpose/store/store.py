@@ -34,14 +34,7 @@ from worldpose.store.paths import (
     reservation_path,
 )
 from worldpose.store.recipes import STORE_FORMAT, recipe_key
-from worldpose.store.runs import (
-    LATEST,
-    begin_run,
-    read_document,
-    read_pin,
-    run_files,
-    run_order,
-)
+from worldpose.store.runs import LATEST, begin_run, read_document, read_pin, run_files, run_order
 from worldpose.store.writer import ResultWriter
 
 if TYPE_CHECKING:

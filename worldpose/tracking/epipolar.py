@@ -59,11 +59,7 @@ def limb_lengths(joints: Floats, fps: float) -> tuple[Floats, Floats]:
 
 
 @compile_kernel
-def footprints(
-    centers: Floats,
-    directions: Floats,
-    ground: tuple[float, float],
-) -> Floats:
+def footprints(centers: Floats, directions: Floats, ground: tuple[float, float]) -> Floats:
     """Return the ground position of each detection's person (n, 3): x, y and uncertainty [m].
 
     The mean ray is cut at the height of a body's centre; the uncertainty is the length of its

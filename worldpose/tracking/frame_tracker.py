@@ -220,12 +220,7 @@ class FrameTracker:
         )
         return index, distance, joints
 
-    def _drop_outlying_views(
-        self,
-        index: Integers,
-        directions: Floats,
-        affinity: Floats,
-    ) -> None:
+    def _drop_outlying_views(self, index: Integers, directions: Floats, affinity: Floats) -> None:
         """Remove, from `index`, matches whose rays pass too far from those of the other views.
 
         Of two views, the one nearer to the prediction stays. After a crossing, the detection of a

@@ -107,11 +107,7 @@ def _mean_known(points: Floats) -> Floats:
 
 
 def join_costs(
-    before: list[End],
-    after: list[End],
-    fps: float,
-    area: float,
-    settings: TrackingSettings,
+    before: list[End], after: list[End], fps: float, area: float, settings: TrackingSettings
 ) -> Floats:
     """Return the cost of joining every track that ends to every track that begins.
 
@@ -218,11 +214,7 @@ def _log_normal_density(offset: Floats, variance: float) -> float:
 
 
 def choose_joins(
-    before: list[End],
-    after: list[End],
-    costs: Floats,
-    fps: float,
-    settings: TrackingSettings,
+    before: list[End], after: list[End], costs: Floats, fps: float, settings: TrackingSettings
 ) -> list[Candidate]:
     """Return the joins of the likeliest assignment, each with its margin, cheapest first.
 
@@ -321,10 +313,7 @@ def identity_certainty(joins: Iterable[Join], person: NDArray[np.integer], frame
 
 
 def find_takeovers(
-    people: Sequence[Person],
-    frame: int,
-    index: Integers,
-    affinity: Floats,
+    people: Sequence[Person], frame: int, index: Integers, affinity: Floats
 ) -> list[Takeover]:
     """Return people who, after a gap, took a detection that another person lost in this frame.
 
@@ -367,10 +356,7 @@ def lasting_takeovers(
 
 
 def describe_doubts(
-    frames: Integers,
-    people: int,
-    takeovers: Sequence[Takeover],
-    joins: Sequence[Join],
+    frames: Integers, people: int, takeovers: Sequence[Takeover], joins: Sequence[Join]
 ) -> str | None:
     """Return a warning about ambiguous identities; None if there are few.
 

@@ -62,13 +62,7 @@ class CameraVisibility:
         near = away <= 1.25 * self.reach[:, None]
         return np.asarray((inside >= 0.8 * known) & (known > 0) & near)
 
-    def learn(
-        self,
-        joints: Floats,
-        directions: Floats,
-        weights: Floats,
-        seen: Flags,
-    ) -> None:
+    def learn(self, joints: Floats, directions: Floats, weights: Floats, seen: Flags) -> None:
         """Update with the known people of one frame.
 
         Args:
@@ -87,11 +81,7 @@ class CameraVisibility:
             self.missed += empty.sum(axis=1)
 
     def misses_score(
-        self,
-        joints: Floats,
-        directions: Floats,
-        weights: Floats,
-        own: Flags,
+        self, joints: Floats, directions: Floats, weights: Floats, own: Flags
     ) -> Floats:
         """Return the log probability (n,) that cameras miss bodies which they should see.
 
@@ -115,11 +105,7 @@ class CameraVisibility:
 
 @compile_kernel
 def find_uncovered_bodies(
-    asked: Flags,
-    joints: Floats,
-    centers: Floats,
-    directions: Floats,
-    weights: Floats,
+    asked: Flags, joints: Floats, centers: Floats, directions: Floats, weights: Floats
 ) -> Flags:
     """Return in which of the asked cameras no detection lies on the image of bodies (cameras, n).
 
@@ -347,10 +333,7 @@ def group_pairs(
 
 
 def _mutually_nearest(
-    first: Integers,
-    second: Integers,
-    distance: Floats,
-    detections: int,
+    first: Integers, second: Integers, distance: Floats, detections: int
 ) -> Flags:
     """Return which pairs (pairs,) are the nearest of both their detections."""
     nearest = np.full(detections, np.inf)
@@ -368,12 +351,7 @@ def _body_scores(joints: Floats) -> Floats:
     return np.asarray(-0.5 * (middle / 0.15) ** 2 - 0.5 * scatter / 0.2**2)
 
 
-def _rival_likelihoods(
-    first: Integers,
-    second: Integers,
-    joints: Floats,
-    score: Floats,
-) -> Floats:
+def _rival_likelihoods(first: Integers, second: Integers, joints: Floats, score: Floats) -> Floats:
     """Return the summed likelihood (pairs,) of each pair's rivals.
 
     A rival shares a detection and has its body elsewhere; a pair with a shared detection and the

@@ -376,12 +376,7 @@ def intersect_people(
 
 @compile_kernel
 def _nearest_point(
-    origin: Floats,
-    ray: Floats,
-    weight: Floats,
-    count: int,
-    point: Point,
-    scale: float,
+    origin: Floats, ray: Floats, weight: Floats, count: int, point: Point, scale: float
 ) -> Point:
     """Return the point nearest to the rays, reweighted at `point`; NaN if they are parallel."""
     a = b = c = d = e = f = g0 = g1 = g2 = total = 0.0
@@ -415,12 +410,7 @@ def _nearest_point(
 
 @compile_kernel
 def _have_wide_angle(
-    origin: Floats,
-    ray: Floats,
-    count: int,
-    point: Point,
-    gate: float,
-    min_sine: float,
+    origin: Floats, ray: Floats, count: int, point: Point, gate: float, min_sine: float
 ) -> bool:
     """Return whether two rays that pass within the gate are `min_sine` apart."""
     x, y, z = point

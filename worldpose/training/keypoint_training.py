@@ -15,13 +15,7 @@ from torch.nn import functional
 from data_contracts.arrays import Flags, Floats, Image, Singles
 from data_contracts.conventions import COCO17_FLIP
 from data_contracts.records import Record
-from worldpose.detection.bundled_nets import (
-    CELL,
-    KeypointNet,
-    Seen,
-    normalize,
-    peaks,
-)
+from worldpose.detection.bundled_nets import CELL, KeypointNet, Seen, normalize, peaks
 from worldpose.detection.bundled_pose import SAME_PERSON_IOU
 from worldpose.detection.crops import (
     CROP,
@@ -244,11 +238,7 @@ def _cut_shrunk(picture: Image, mapping: Floats, scale: float) -> Image:
 
 
 def _cover(
-    crop: Image,
-    other: Image,
-    pixels: Floats,
-    visible: NDArray[np.int8],
-    rng: np.random.Generator,
+    crop: Image, other: Image, pixels: Floats, visible: NDArray[np.int8], rng: np.random.Generator
 ) -> None:
     """Put a part of another crop over the person, in place; joints under it become occluded."""
     width, height = int(rng.integers(12, 44)), int(rng.integers(16, 72))

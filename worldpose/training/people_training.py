@@ -118,11 +118,7 @@ def boxes_in_window(
 
 
 def draw_targets(
-    boxes: Floats,
-    ignored: Floats,
-    target: Singles,
-    weight: Singles,
-    sides: Singles,
+    boxes: Floats, ignored: Floats, target: Singles, weight: Singles, sides: Singles
 ) -> None:
     """Write one window's target, weight and boxes, in place."""
     middles = np.arange(target.shape[0]) * STRIDE + 0.5 * (STRIDE - 1)

@@ -40,10 +40,7 @@ from worldpose.triangulation.change_sums import (
     half_window,
     sum_joints,
 )
-from worldpose.triangulation.clocks import (
-    shift_in_time,
-    triangulate_views,
-)
+from worldpose.triangulation.clocks import shift_in_time, triangulate_views
 from worldpose.triangulation.residuals import Rig
 from worldpose.triangulation.settings import TriangulationSettings
 

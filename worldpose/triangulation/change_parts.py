@@ -23,13 +23,7 @@ from typing import Final, Literal, Self
 import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Integers
-from worldpose.triangulation.change_sums import (
-    UNKNOWNS,
-    WIDTH,
-    ChangeSums,
-    Kind,
-    Noise,
-)
+from worldpose.triangulation.change_sums import UNKNOWNS, WIDTH, ChangeSums, Kind, Noise
 from worldpose.triangulation.synchronization import PRIOR
 
 MIN_SIZE: Final = {

@@ -98,9 +98,7 @@ def estimate_clocks(
         loose = settings.model_copy(update={"max_deviation": gate})
 
         def sum_up(
-            part: KeypointDetections,
-            late: Floats = late,
-            loose: TriangulationSettings = loose,
+            part: KeypointDetections, late: Floats = late, loose: TriangulationSettings = loose
         ) -> PersonSums:
             return sum_equations(MovingJoints.find(rig, shift_in_time(part, late), fps, loose))
 

@@ -56,10 +56,7 @@ PART: Final = 2.0 * math.log(150.0)
 
 
 def find_swaps(
-    observations: Observations,
-    noise: tuple[float, float],
-    limit: float,
-    found: SolvedJoints,
+    observations: Observations, noise: tuple[float, float], limit: float, found: SolvedJoints
 ) -> Flags:
     """Return the left-right swaps of body parts (frames, cameras, persons, parts).
 

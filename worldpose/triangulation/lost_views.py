@@ -121,10 +121,7 @@ class _Meetings:
         if seen[seen > 0].mean() < 1.2:
             return None
         late, shift = self._best_delay(chosen, 2 * second), self._best_shift(chosen)
-        changes: dict[Kind, tuple[int, Floats]] = {
-            "clock": (late, np.zeros(2)),
-            "view": (0, shift),
-        }
+        changes: dict[Kind, tuple[int, Floats]] = {"clock": (late, np.zeros(2)), "view": (0, shift)}
         for wide in (1.0, 2.0):  # a turned view is not shifted everywhere alike
             usual = self._met(rows[:place], wide).sum() / count[:place].sum()
             now = self._met(chosen, wide).sum() / seen.sum()

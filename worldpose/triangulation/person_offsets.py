@@ -103,10 +103,7 @@ def stated_errors(
 
 
 def learn_factor(
-    observations: Observations,
-    noise: tuple[float, float],
-    first: SolvedJoints,
-    stated: Floats,
+    observations: Observations, noise: tuple[float, float], first: SolvedJoints, stated: Floats
 ) -> float:
     """Return the most probable factor on the stated variance for a sample of frames.
 
@@ -137,10 +134,7 @@ def learn_factor(
 
 
 def estimate_offsets(
-    observations: Observations,
-    noise: tuple[float, float],
-    first: SolvedJoints,
-    variance: Floats,
+    observations: Observations, noise: tuple[float, float], first: SolvedJoints, variance: Floats
 ) -> tuple[Floats, Floats]:
     """Return the most probable offsets of people in the images, estimated with the joints.
 

@@ -15,24 +15,11 @@ from data_contracts.arrays import Floats
 from worldpose.geometry.rows import join_rows, take_rows
 from worldpose.triangulation.clocks import CameraClocks
 from worldpose.triangulation.noise_model import NoiseModel
-from worldpose.triangulation.report import (
-    Agreement,
-    Changes,
-    SmoothingReport,
-    TriangulationReport,
-)
+from worldpose.triangulation.report import Agreement, Changes, SmoothingReport, TriangulationReport
 
 FRAME_ARRAYS = (
-    "joints",
-    "covariance",
-    "views",
-    "spread",
-    "reprojection_error",
-    "inliers",
-    "exchanged",
-    "offsets",
-    "lasting_covariance",
-    "bias_variance",
+    *("joints", "covariance", "views", "spread", "reprojection_error", "inliers"),
+    *("exchanged", "offsets", "lasting_covariance", "bias_variance"),
 )
 """Attributes of `Triangulation` with a dimension of frames."""
 

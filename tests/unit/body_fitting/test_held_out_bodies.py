@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from camera_builders import look_at_camera, plain_camera
+from camera_builders import plain_camera, ring_of_cameras
 from scipy.special import chdtri
 from walking_bodies import KEYPOINTS, MODEL, walker
 
@@ -21,7 +21,6 @@ from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.standing import find_standing_distance
 from worldpose.errors import InputError
-from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.simulation.detector_errors import MonocularErrors, estimate_bodies
 from worldpose.triangulation.estimate import triangulate_joints
@@ -34,8 +33,7 @@ GROUPS = list(JOINT_GROUPS)
 def ring(count):
     """Cameras around the origin, 40 m away."""
     angles = np.linspace(0.0, 5.5, count)
-    places = [(40.0 * np.cos(angle), 40.0 * np.sin(angle), 12.0) for angle in angles]
-    return Camera.stack([look_at_camera(place, (0.0, 0.0, 1.0), 3000.0) for place in places])
+    return ring_of_cameras(angles, 12.0, (0.0, 0.0, 1.0), 3000.0, away=40.0)
 
 
 def filmed(cameras, noise_px, seed, people=3, frames=60):

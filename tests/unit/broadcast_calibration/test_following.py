@@ -19,10 +19,7 @@ from worldpose.broadcast_calibration.pitch_errors import PitchErrors
 from worldpose.broadcast_calibration.players import People, estimate_feed_offset
 from worldpose.broadcast_calibration.priors import build_prior
 from worldpose.broadcast_calibration.residuals import linearize
-from worldpose.broadcast_calibration.settings import (
-    BroadcastCalibrationSettings,
-    BroadcastPrior,
-)
+from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings, BroadcastPrior
 from worldpose.broadcast_calibration.solver import solve
 from worldpose.broadcast_calibration.tracking import (
     Followed,

@@ -8,14 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from faulty_data_sets import (
-    FPS,
-    HALF,
-    PERSONS,
-    edit,
-    results,
-    transpose_rotation,
-)
+from faulty_data_sets import FPS, HALF, PERSONS, edit, results, transpose_rotation
 from run_records import StubRun, match_spec
 
 from data_contracts.conventions import COCO17

@@ -10,14 +10,13 @@ import shutil
 import numpy as np
 import pytest
 from camera_builders import plain_camera
+from command_line import invoke
 from faulty_data_sets import FRAMES, PERSONS, edit, transpose_rotation
 from matplotlib.image import imread
-from typer.testing import CliRunner
 
 from data_contracts.conventions import COCO17
 from data_contracts.release import ReleasedClip, ReleaseManifest
 from data_contracts.usability import Usability
-from flows.cli.app import app
 from flows.results.dataset import count
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BodyParameters
@@ -129,10 +128,10 @@ def test_a_frame_rate_that_nobody_stated_is_said_and_an_export_s_is_taken(tmp_pa
     joints = np.tile(places.swapaxes(0, 1)[:, :, None], (1, 1, 17, 1))
     write_joints(tmp_path / "joints.npz", JointTracks(np.arange(50), np.arange(2), joints))
     told = "no frame rate is stated: 50 per second is assumed (--fps)"
-    assert told in CliRunner().invoke(app, [command, str(tmp_path)]).stderr
-    assert told not in CliRunner().invoke(app, [command, str(tmp_path), "--fps", "30"]).stderr
+    assert told in invoke(command, tmp_path).stderr
+    assert told not in invoke(command, tmp_path, "--fps", 30).stderr
     write_frame_rates(tmp_path, {"A_1": 25.0})
-    assert told not in CliRunner().invoke(app, [command, str(tmp_path)]).stderr
+    assert told not in invoke(command, tmp_path).stderr
     assert count([tmp_path]).clips["clip"].seconds == pytest.approx(2.0)
     assert count([tmp_path], fps=50.0).clips["clip"].seconds == pytest.approx(1.0)
 
@@ -308,7 +307,7 @@ def test_scores_are_those_of_each_clip_and_of_all_their_joints(
 
 
 def run(*arguments):
-    return CliRunner().invoke(app, ["evaluate", *map(str, arguments)])
+    return invoke("evaluate", *arguments)
 
 
 def test_the_command_writes_tables_and_a_picture(clips, reference, tmp_path):

@@ -4,12 +4,11 @@ import json
 
 import numpy as np
 import pytest
+from command_line import invoke
 from people_samples import person
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
 from data_contracts.conventions import COCO17
-from flows.cli.app import app
 from worldpose.errors import InputError
 from worldpose.evaluation.challenge import ALL, score_submission
 from worldpose.evaluation.marker_reference import (
@@ -455,9 +454,7 @@ def test_the_score_is_the_global_error_and_five_times_the_local_one(tmp_path, jo
     score = score_submission(mine, truth)["one"]
     np.testing.assert_allclose((score.global_m, score.local_m), (whole, local), atol=1e-6)
     assert score.poses == 6
-    told = CliRunner().invoke(
-        app, ["evaluate", "--prediction", str(mine), "--reference", str(truth), "--json"]
-    )
+    told = invoke("evaluate", "--prediction", mine, "--reference", truth, "--json")
     assert json.loads(told.stdout)["challenge_score"] == pytest.approx(whole + 5 * local, abs=1e-5)
 
 

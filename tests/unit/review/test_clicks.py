@@ -24,12 +24,7 @@ from worldpose.errors import InputError
 from worldpose.formats.annotations.annotated_images import AnnotatedImage, AnnotatedPerson
 from worldpose.ingest.match_folder import MatchFolder
 from worldpose.review.clicks import replay_corrections
-from worldpose.review.detections import (
-    find_changes,
-    find_objection,
-    image_name,
-    replay_detections,
-)
+from worldpose.review.detections import find_changes, find_objection, image_name, replay_detections
 from worldpose.review.journal import append, read_journal
 from worldpose.store.blobs import Entry
 from worldpose.store.store import Store

@@ -2,9 +2,7 @@
 
 import numpy as np
 import pytest
-from camera_builders import look_at_camera
-
-from worldpose.geometry.cameras import Camera
+from camera_builders import ring_of_cameras
 
 SKELETON = np.array(
     [
@@ -21,16 +19,12 @@ SKELETON = np.array(
 def ring():
     """Cameras 30 m from the origin, 6 to 9 m up, looking at it with 1500 px focal length."""
 
+    lens = {"middle": (960.0, 540.0), "lens": (-0.1, 0.02, 0.0, 0.0, 0.0)}
+
     def build(count):
-        cameras = []
-        for n in range(count):
-            angle = 2 * np.pi * (n + 0.3) / count
-            center = [30 * np.cos(angle), 30 * np.sin(angle), 6.0 + n % 4]
-            lens = (-0.1, 0.02, 0.0, 0.0, 0.0)
-            cameras.append(
-                look_at_camera(center, (0.0, 0.0, 0.0), 1500.0, middle=(960.0, 540.0), lens=lens)
-            )
-        return Camera.stack(cameras)
+        angles = 2 * np.pi * (np.arange(count) + 0.3) / count
+        up = 6.0 + np.arange(count) % 4
+        return ring_of_cameras(angles, up, (0.0, 0.0, 0.0), 1500.0, **lens)
 
     return build
 

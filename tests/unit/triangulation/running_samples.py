@@ -29,7 +29,7 @@ def runner(frames, persons=2, seed=0):
     return body + way[:, :, None] + swing[..., None] * [1.0, 0.5, 0.2]
 
 
-def detections(camera, joints, noise, seed=1):
+def detections(camera, joints, noise=0.0, seed=1):
     """Keypoints with white noise [px], confidence 1 and the index of every person."""
     frames, persons, count, _ = joints.shape
     image = camera.project(joints.reshape(frames, 1, persons * count, 3))

@@ -24,11 +24,7 @@ from worldpose.triangulation.camera_changes import (
 )
 from worldpose.triangulation.change_parts import Part, find_sway, fit_parts
 from worldpose.triangulation.change_sums import ChangeSums
-from worldpose.triangulation.clock_courses import (
-    add_slow_drifts,
-    shift_by_courses,
-    trace_clocks,
-)
+from worldpose.triangulation.clock_courses import add_slow_drifts, shift_by_courses, trace_clocks
 from worldpose.triangulation.clocks import triangulate_views
 from worldpose.triangulation.lost_views import find_lone_views, find_lost_views
 from worldpose.triangulation.residuals import Rig

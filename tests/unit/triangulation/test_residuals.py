@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from running_samples import detections as seen
 
 from data_contracts.conventions import FEET
 from data_contracts.keypoints import KeypointDetections
@@ -69,7 +70,7 @@ FPS = 50.0
 
 
 @pytest.fixture
-def clip(ring, seen):
+def clip(ring):
     """Six cameras, two people; true points (frames, persons, 6, 3) and noisy detections."""
     rng = np.random.default_rng(5)
     cameras = ring(6)
@@ -131,7 +132,7 @@ def some_joints(persons=2, count=17, frames=1):
     return rng.uniform([-4, -4, 0], [4, 4, 2], (frames, persons, count, 3))
 
 
-def test_one_view_determines_nothing(ring, seen):
+def test_one_view_determines_nothing(ring):
     keypoints, confidence, index = seen(ring(3), some_joints())
     index[:, 1:] = -1
     result = triangulate_joints(ring(3), as_detections(keypoints, confidence, index), SETTINGS)
@@ -143,7 +144,7 @@ def test_one_view_determines_nothing(ring, seen):
     assert result.report.undetermined == 34
 
 
-def test_two_nearly_parallel_rays_determine_nothing(ring, seen):
+def test_two_nearly_parallel_rays_determine_nothing(ring):
     # Two cameras 0.06 rad apart on the ring, less than the 0.1 rad asked for.
     narrow = ring(2, arc=0.12)
     result = triangulate_joints(narrow, as_detections(*seen(narrow, some_joints())), SETTINGS)
@@ -154,7 +155,7 @@ def test_two_nearly_parallel_rays_determine_nothing(ring, seen):
     ).all()
 
 
-def test_nan_keypoints_and_confidence_that_is_not_positive_are_left_out(ring, seen):
+def test_nan_keypoints_and_confidence_that_is_not_positive_are_left_out(ring):
     keypoints, confidence, index = seen(ring(5), some_joints())
     keypoints[:, 0] = np.nan
     keypoints[:, 1] += 50.0
@@ -167,7 +168,7 @@ def test_nan_keypoints_and_confidence_that_is_not_positive_are_left_out(ring, se
     np.testing.assert_allclose(result.joints, some_joints(), atol=1e-8)
 
 
-def test_cameras_are_taken_as_a_list_and_by_name_and_indices_as_a_list(ring, seen):
+def test_cameras_are_taken_as_a_list_and_by_name_and_indices_as_a_list(ring):
     keypoints, confidence, index = seen(ring(3), some_joints())
     given = as_detections(keypoints, confidence, index.tolist())
     cameras = [ring(3)[n] for n in range(3)]
@@ -177,7 +178,7 @@ def test_cameras_are_taken_as_a_list_and_by_name_and_indices_as_a_list(ring, see
 
 
 @pytest.mark.parametrize("count", [2, 4, 16])
-def test_noise_free_views_give_the_joint(ring, seen, count):
+def test_noise_free_views_give_the_joint(ring, count):
     # Two cameras of four, so that they do not face each other.
     cameras = ring(4)[np.array([0, 1])] if count == 2 else ring(count)
     joints = some_joints(frames=3)
@@ -194,7 +195,7 @@ def test_noise_free_views_give_the_joint(ring, seen, count):
 
 @pytest.mark.parametrize("count", [3, 8])
 @pytest.mark.parametrize("offset", [20.0, 500.0])
-def test_outlier_view_is_rejected_and_named(ring, seen, count, offset):
+def test_outlier_view_is_rejected_and_named(ring, count, offset):
     keypoints, confidence, index = seen(ring(count), some_joints())
     keypoints[:, 1] += offset / np.sqrt(2)
     result = triangulate_joints(ring(count), as_detections(keypoints, confidence, index), SETTINGS)
@@ -207,7 +208,7 @@ def test_outlier_view_is_rejected_and_named(ring, seen, count, offset):
     assert result.report.rejected_share[1] == 1.0
 
 
-def test_reprojection_error_is_the_root_mean_square_length_in_pixels(ring, seen):
+def test_reprojection_error_is_the_root_mean_square_length_in_pixels(ring):
     keypoints, confidence, index = seen(ring(6), some_joints(1, 17))
     keypoints += np.random.default_rng(3).normal(0, 1.0, keypoints.shape)
     result = triangulate_joints(ring(6), as_detections(keypoints, confidence, index), STATED)
@@ -219,7 +220,7 @@ def test_reprojection_error_is_the_root_mean_square_length_in_pixels(ring, seen)
     np.testing.assert_allclose(result.reprojection_error[0, 0], expected, rtol=1e-3)
 
 
-def test_result_is_the_least_squares_point_of_the_weighted_pixels(ring, seen):
+def test_result_is_the_least_squares_point_of_the_weighted_pixels(ring):
     keypoints, confidence, index = seen(ring(4), some_joints(1, 3))
     rng = np.random.default_rng(4)
     keypoints += rng.normal(0, 1.0, keypoints.shape)
@@ -240,7 +241,7 @@ def test_result_is_the_least_squares_point_of_the_weighted_pixels(ring, seen):
             assert (cost(moved) > best).all()
 
 
-def monte_carlo(cameras, seen, scale):
+def monte_carlo(cameras, scale):
     """Errors and covariances of one joint under white noise of `scale` [px], 4000 times."""
     joint = np.array([1.0, -2.0, 1.2])
     keypoints, confidence, index = seen(cameras, np.broadcast_to(joint, (4000, 1, 1, 3)))
@@ -254,8 +255,8 @@ def monte_carlo(cameras, seen, scale):
     return result.joints[:, 0, 0] - joint, result.covariance[:, 0, 0]
 
 
-def test_covariance_is_the_spread_of_a_monte_carlo(ring, seen):
-    errors, covariance = monte_carlo(ring(8, arc=2.0), seen, 1.0)
+def test_covariance_is_the_spread_of_a_monte_carlo(ring):
+    errors, covariance = monte_carlo(ring(8, arc=2.0), 1.0)
     stated = covariance.mean(axis=0)
     sampled = errors.T @ errors / len(errors)
     # In coordinates where the stated covariance is the identity, the sampled one has entries

@@ -102,11 +102,7 @@ def estimate_plane_clocks(
 
 
 def _choose_part(
-    positions: GroundPositions,
-    pair: tuple[int, int],
-    longest: int,
-    fps: float,
-    max_offset_s: float,
+    positions: GroundPositions, pair: tuple[int, int], longest: int, fps: float, max_offset_s: float
 ) -> int:
     """Return the first of the `longest` frames in which most people of one camera are near others.
 

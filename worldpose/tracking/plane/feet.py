@@ -227,11 +227,7 @@ def locate_feet(
 
 
 def _are_parts(
-    boxes: AnyFloats,
-    keypoints: AnyFloats,
-    confidence: AnyFloats,
-    chosen: Flags,
-    on_pitch: Flags,
+    boxes: AnyFloats, keypoints: AnyFloats, confidence: AnyFloats, chosen: Flags, on_pitch: Flags
 ) -> Flags:
     """Return which chosen boxes a surer detection of their frame explains.
 

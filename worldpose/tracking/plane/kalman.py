@@ -142,11 +142,7 @@ def _correct(
 
 @compile_kernel
 def _smooth_backwards(
-    move: Floats,
-    expected: Floats,
-    expected_covariance: Floats,
-    state: Floats,
-    covariance: Floats,
+    move: Floats, expected: Floats, expected_covariance: Floats, state: Floats, covariance: Floats
 ) -> None:
     """Smooth filtered states (frames, 4) and covariances (frames, 4, 4) in place.
 

@@ -73,10 +73,7 @@ def merge_paths(paths: list[PlanePath], fps: float, positions: GroundPositions) 
 def _common(a: PlanePath, b: PlanePath) -> tuple[slice, slice]:
     """Return the common frames of two paths, as rows of each; empty if there are none."""
     first, last = max(a.first, b.first), max(min(a.last, b.last), max(a.first, b.first) - 1)
-    return (
-        slice(first - a.first, last - a.first + 1),
-        slice(first - b.first, last - b.first + 1),
-    )
+    return (slice(first - a.first, last - a.first + 1), slice(first - b.first, last - b.first + 1))
 
 
 def _is_same_person(a: PlanePath, b: PlanePath, fps: float, positions: GroundPositions) -> bool:
