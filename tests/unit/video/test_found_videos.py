@@ -142,6 +142,18 @@ def encode(path, count=30, options=None, name="libx264"):
     return path
 
 
+def test_parts_of_a_dvd_are_joined_as_one_stream(tmp_path):
+    whole = encode(tmp_path / "whole.vob", 100, {"g": "12", "bf": "2"}, "mpeg2video").read_bytes()
+    (tmp_path / "videos" / "cam1").mkdir(parents=True)
+    cut = len(whole) // 2
+    for number, content in enumerate((b"menu", whole[:cut], whole[cut:])):
+        (tmp_path / "videos" / "cam1" / f"VTS_01_{number}.VOB").write_bytes(content)
+    with pytest.raises(InputError, match=r"one recording: VTS_01_1\.VOB, VTS_01_2\.VOB"):
+        find_videos(tmp_path / "videos")
+    found = find_videos(tmp_path / "videos", tmp_path)
+    assert found["cam1"].read_bytes() == whole
+
+
 def test_interlaced_fields_are_said_and_progressive_frames_are_not(tmp_path):
     file = encode(tmp_path / "a.mts", options={"x264-params": "interlaced=1"})
     with VideoReader(file) as video:

@@ -142,6 +142,22 @@ def test_access_by_number_equals_a_whole_pass(container, codec, tmp_path):
             assert number_in(video.frame(number)) == number
 
 
+@pytest.mark.parametrize("between", ["0", "2"])
+def test_the_last_frame_of_gxf_which_counts_fields_is_a_frame_later(tmp_path, between):
+    path = tmp_path / "clip.gxf"
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream("mpeg2video", rate=25, options={"bf": between})
+        stream.height, stream.width, stream.pix_fmt = 576, 720, "yuv420p"
+        for grey in range(0, 130, 10):
+            picture = np.full((576, 720), grey, np.uint8)
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="gray")))
+        file.mux(stream.encode(None))
+    with VideoReader(path) as video:
+        assert video.index.fps == pytest.approx(25.0)
+        assert video.index.on_clock(25.0, "clip").tolist() == list(range(13))
+        assert abs(video.frame(12).mean() - 120.0) < 3.0
+
+
 @pytest.mark.parametrize(
     ("codec", "pixels"),
     [("ffv1", "yuv422p12le"), ("ffv1", "bgr0"), ("ffv1", "gray"), ("ffv1", "gray16le")]
