@@ -82,6 +82,17 @@ def coco(file, clicks):
     return file
 
 
+def labelme(file, clicks, lines=()):
+    marked = [("point", label, [at]) for label, at in clicks] + [("line", *a) for a in lines]
+    shapes = [
+        {"label": label, "shape_type": kind, "points": (np.array(at) + 0.5).tolist()}
+        for kind, label, at in marked
+    ]
+    about = {"imagePath": "..\\img\\east.png", "imageWidth": SIZE[0], "imageHeight": SIZE[1]}
+    file.write_text(json.dumps({"version": "5.5.0", "shapes": shapes, "imageData": None, **about}))
+    return file
+
+
 def clicked(folder, camera="east"):
     spec = read_spec(folder)
     file = folder / "annotations" / "static_calibration" / f"{camera}.json"
@@ -89,7 +100,7 @@ def clicked(folder, camera="east"):
     return {point.name: point.xy for point in found.points}, found.drawn
 
 
-@pytest.mark.parametrize("write", [cvat, label_studio, coco])
+@pytest.mark.parametrize("write", [cvat, label_studio, labelme, coco])
 def test_every_form_gives_the_same_clicks(tmp_path, write):
     folder = match(tmp_path / "m")
     lines = [] if write is coco else [("touch_line_near", LINE)]
@@ -351,34 +362,16 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path, change, o
     assert {each.name for each in folder.iterdir()} == {"match.yaml"}
 
 
+KINDS = {"keypointlabels": "corner_left_near", "brushlabels": "halfway_line"}
+SIDES = {"original_width": 1920, "original_height": 1080}
+DRAWN = [{"type": k, "value": {"x": 50, "y": 50, k: [v]}, **SIDES} for k, v in KINDS.items()]
+TASK = {"data": {"image": "east.png"}, "annotations": [{"result": DRAWN}]}
 LEFT_OUT = {
     "cvat.xml": """<annotations><image name="east.png" width="1920" height="1080">
-<points label="corner_left_near" points="100.5,200.5"/><box label="b"/>
-<polygon label="adboard" points="1,2;3,4;5,6"/><ellipse label="center_circle"/>
-<polygon label="halfway_line" points="1.5,2.5;3.5,4.5"/></image></annotations>""",
-    "studio.json": json.dumps(
-        [
-            {
-                "data": {"image": "east.png"},
-                "annotations": [
-                    {
-                        "result": [
-                            {
-                                "type": kind,
-                                "original_width": 1920,
-                                "original_height": 1080,
-                                "value": {"x": 50, "y": 50, kind: [label]},
-                            }
-                            for kind, label in (
-                                ("keypointlabels", "corner_left_near"),
-                                ("brushlabels", "halfway_line"),
-                            )
-                        ]
-                    }
-                ],
-            }
-        ]
-    ),
+<points label="corner_left_near" points="100.5,200.5"/><box label="b"/><ellipse
+label="center_circle"/><polygon label="adboard" points="1,2;3,4;5,6"/><polygon
+label="halfway_line" points="1.5,2.5;3.5,4.5"/></image></annotations>""",
+    "studio.json": json.dumps([TASK]),
     "coco.json": json.dumps(
         {
             "images": [{"id": 1, "file_name": "east.png", "width": 1920, "height": 1080}],
@@ -412,10 +405,18 @@ def test_shapes_that_are_not_read_are_counted(tmp_path, name, said):
     assert report.clicks == {"east": 2 if name == "cvat.xml" else 1}
 
 
-@pytest.mark.parametrize("content", [b"", b"<html></html>", b"[1]", b"{}", b"{", b"\xff\xfe"])
-def test_other_files_are_refused(tmp_path, content):
-    (tmp_path / "c").write_bytes(content)
-    with pytest.raises(InputError, match="labelled points of CVAT"):
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [(each, "CVAT") for each in ("", "<html></html>", "[1]", "{}", "{", "\udcff\udcfe")]
+    + [
+        ('{"_via_img_metadata": {}}', "VIA .*has no image sizes; convert it to COCO"),
+        ('{"east.png123": {"filename": "east.png", "regions": []}}', "VIA"),
+        ('{"size": {"height": 9, "width": 9}, "objects": []}', "Supervisely; convert it to COCO"),
+    ],
+)
+def test_other_files_are_refused(tmp_path, content, said):
+    (tmp_path / "c").write_bytes(content.encode(errors="surrogateescape"))
+    with pytest.raises(InputError, match=f"labelled points of .*{said}"):
         read_marked_images(tmp_path / "c")
 
 

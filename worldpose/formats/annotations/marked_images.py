@@ -1,4 +1,4 @@
-"""Clicked points and drawn lines of images in files of CVAT, Label Studio, COCO and SoccerNet.
+"""Clicked points and drawn lines in files of CVAT, Label Studio, labelme, COCO and SoccerNet.
 
 CVAT for video gives the images of its key frames; what it interpolates between them is no click.
 
@@ -68,7 +68,7 @@ class MarkedImage:
 
 
 def read_marked_images(path: Path) -> list[MarkedImage]:
-    """Return images with shapes of CVAT, Label Studio, COCO, SoccerNet; InputError without any."""
+    """Return images with shapes of the programs above; InputError without any."""
     max_bytes = 1 << 26  # maximum file size [bytes]
 
     def decode(content: bytes) -> list[MarkedImage]:
@@ -87,7 +87,8 @@ def read_marked_images(path: Path) -> list[MarkedImage]:
         _require_pixels(found, per_cent=begin == b"[")
         return [image for image in found if image.points or image.lines or image.left_out]
 
-    expected = "labelled points of CVAT (XML 1.1), Label Studio or COCO, or SoccerNet's lines"
+    expected = "labelled points of CVAT (XML 1.1), Label Studio, labelme or COCO, or SoccerNet's "
+    expected += "lines"
     todo = "Export the clicks from the annotator in one of these forms."
     return decode_file(path, max_bytes, decode, expected, todo)
 
@@ -314,6 +315,10 @@ def _read_coco(content: bytes) -> Iterator[MarkedImage]:
     if isinstance(given, dict) and "data" in given and "images" not in given:
         yield from _read_label_studio(json.dumps([given]).encode())
         return
+    if isinstance(given, dict) and "shapes" in given:
+        yield _read_labelme(given)
+        return
+    _require_known(given)
     if isinstance(given, dict) and isinstance(given.get("annotations"), list):
         marked = [each for each in given["annotations"] if isinstance(each, dict)]
         if any(isinstance(each.get("lines"), dict) for each in marked):
@@ -344,6 +349,50 @@ def _read_coco(content: bytes) -> Iterator[MarkedImage]:
                     points.append((label, np.array([x, y])))
         size = image.width, image.height
         yield MarkedImage(image.file_name, size, tuple(points), (), left_out=tuple(left_out))
+
+
+class _Shape(Given):
+    label: str
+    kind: str = Field(default="polygon", alias="shape_type")
+    points: tuple[tuple[float, float], ...]
+
+
+class _Labelme(Given):
+    shapes: tuple[_Shape, ...]
+    name: str = Field(alias="imagePath")
+    width: int = Field(alias="imageWidth", ge=1)
+    height: int = Field(alias="imageHeight", ge=1)
+
+
+def _read_labelme(given: dict[str, Any]) -> MarkedImage:
+    """Return the only image of a file of labelme, which counts pixels from the image's corner."""
+    image = _Labelme.model_validate(given)
+    drawn = [(e.kind, e.label, np.array(e.points) - CORNER) for e in image.shapes if e.points]
+    lines = ("line", "linestrip", "polygon")
+    return MarkedImage(
+        image.name,
+        (image.width, image.height),
+        tuple((label, at[0]) for kind, label, at in drawn if kind == "point"),
+        tuple((label, at) for kind, label, at in drawn if kind in lines),
+        areas=frozenset(label for kind, label, _ in drawn if kind == "polygon"),
+        left_out=tuple(f"{k} of {label}" for k, label, _ in drawn if k not in ("point", *lines)),
+    )
+
+
+def _require_known(given: object) -> None:
+    """Raise ContentError for files of VIA and Supervisely, with what can be given in their place.
+
+    VIA states no size of the images, and Supervisely not where in a pixel a place is.
+    """
+    parts = given if isinstance(given, dict) else {}
+    of_via = any(isinstance(part, dict) and "regions" in part for part in parts.values())
+    instead = "convert it to COCO keypoints with the names of the points"
+    if of_via or "_via_img_metadata" in parts:
+        raise ContentError(
+            f"a file of VIA (VGG Image Annotator), which has no image sizes; {instead}"
+        )
+    if {"objects", "size"} <= parts.keys():
+        raise ContentError(f"a file of Supervisely; {instead}")
 
 
 class _Share(Given):
