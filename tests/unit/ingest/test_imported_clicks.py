@@ -27,10 +27,7 @@ LINE = [(100.0, 200.0), (300.0, 250.5)]
 def match(folder, *, pitch=None):
     folder.mkdir()
     lines = ["contract: 1", "match_id: m", "fps: 25", "cameras:"]
-    lines += [
-        "  - {id: east, width: 1920, height: 1080}",
-        "  - {id: west, width: 1920, height: 1080}",
-    ]
+    lines += [f"  - {{id: {name}, width: 1920, height: 1080}}" for name in ("east", "west")]
     lines += ["  - {id: main, width: 1920, height: 1080, kind: broadcast}", "clips:"]
     lines += ["  - {id: goal, first_frame: 0, frame_count: 50, broadcast: main}"]
     (folder / "match.yaml").write_text("\n".join(lines) + "\n")
