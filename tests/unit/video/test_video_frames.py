@@ -96,20 +96,22 @@ KEPT_IN = {
     "m2ts": ("h264_one_group",),
     "mpg": ("mpeg2",),
     "mxf": ("mpeg2",),
+    "gxf": ("mpeg2",),  # the last frame is stored one field early
     "flv": ("h264_short",),
     "webm": ("vp9",),
 }
 
 
-def blocks(number):
+def blocks(number, high, wide):
     """An image of eight blocks, each bright where the number has this bit."""
     bits = [220 if number >> bit & 1 else 30 for bit in range(8)]
-    picture = np.array(bits, np.uint8).reshape(2, 4).repeat(24, 0).repeat(16, 1)
+    picture = np.array(bits, np.uint8).reshape(2, 4).repeat(high // 2, 0).repeat(wide // 4, 1)
     return np.repeat(picture[..., None], 3, axis=2)
 
 
 def number_in(picture):
-    middle = picture.reshape(2, 24, 4, 16, -1)[:, 4:20, :, 4:12].mean(axis=(1, 3, 4))
+    high, wide = picture.shape[0] // 2, picture.shape[1] // 4
+    middle = picture.reshape(2, high, 4, wide, -1)[:, 4:-4, :, 4:-4].mean(axis=(1, 3, 4))
     return int((1 << np.flatnonzero(middle.ravel() > 125)).sum())
 
 
@@ -118,10 +120,11 @@ def write_blocks(path, codec):
     name, pixels, options = CODECS[codec]
     with av.open(str(path), "w") as file:
         stream = file.add_stream(name, rate=25, options={"g": "10", **options})
-        stream.height, stream.width, stream.pix_fmt = *SIZE, pixels
+        size = (576, 720) if path.suffix == ".gxf" else SIZE  # GXF has those of television alone
+        stream.height, stream.width, stream.pix_fmt = *size, pixels
         stream.codec_context.thread_count = 1
         for number in range(40):
-            frame = av.VideoFrame.from_ndarray(blocks(number), format="rgb24")
+            frame = av.VideoFrame.from_ndarray(blocks(number, *size), format="rgb24")
             file.mux(stream.encode(frame))
         file.mux(stream.encode(None))
 
@@ -140,22 +143,6 @@ def test_access_by_number_equals_a_whole_pass(container, codec, tmp_path):
         mixed = np.random.default_rng(0).permutation(40).tolist()
         for number in [0, 20, 39, *range(39, -1, -3), *mixed[:15]]:
             assert number_in(video.frame(number)) == number
-
-
-@pytest.mark.parametrize("between", ["0", "2"])
-def test_the_last_frame_of_gxf_which_counts_fields_is_a_frame_later(tmp_path, between):
-    path = tmp_path / "clip.gxf"
-    with av.open(str(path), "w") as file:
-        stream = file.add_stream("mpeg2video", rate=25, options={"bf": between})
-        stream.height, stream.width, stream.pix_fmt = 576, 720, "yuv420p"
-        for grey in range(0, 130, 10):
-            picture = np.full((576, 720), grey, np.uint8)
-            file.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="gray")))
-        file.mux(stream.encode(None))
-    with VideoReader(path) as video:
-        assert video.index.fps == pytest.approx(25.0)
-        assert video.index.on_clock(25.0, "clip").tolist() == list(range(13))
-        assert abs(video.frame(12).mean() - 120.0) < 3.0
 
 
 @pytest.mark.parametrize(

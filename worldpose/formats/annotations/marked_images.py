@@ -315,7 +315,7 @@ def _read_coco(content: bytes) -> Iterator[MarkedImage]:
     if isinstance(given, dict) and "data" in given and "images" not in given:
         yield from _read_label_studio(json.dumps([given]).encode())
         return
-    if isinstance(given, dict) and "shapes" in given:
+    if "shapes" in given:
         yield _read_labelme(given)
         return
     _require_known(given)
@@ -353,46 +353,30 @@ def _read_coco(content: bytes) -> Iterator[MarkedImage]:
 
 class _Shape(Given):
     label: str
-    kind: str = Field(default="polygon", alias="shape_type")
+    shape_type: str = "polygon"
     points: tuple[tuple[float, float], ...]
 
 
-class _Labelme(Given):
-    shapes: tuple[_Shape, ...]
-    name: str = Field(alias="imagePath")
-    width: int = Field(alias="imageWidth", ge=1)
-    height: int = Field(alias="imageHeight", ge=1)
-
-
 def _read_labelme(given: dict[str, Any]) -> MarkedImage:
-    """Return the only image of a file of labelme, which counts pixels from the image's corner."""
-    image = _Labelme.model_validate(given)
-    drawn = [(e.kind, e.label, np.array(e.points) - CORNER) for e in image.shapes if e.points]
-    lines = ("line", "linestrip", "polygon")
-    return MarkedImage(
-        image.name,
-        (image.width, image.height),
-        tuple((label, at[0]) for kind, label, at in drawn if kind == "point"),
-        tuple((label, at) for kind, label, at in drawn if kind in lines),
-        areas=frozenset(label for kind, label, _ in drawn if kind == "polygon"),
-        left_out=tuple(f"{k} of {label}" for k, label, _ in drawn if k not in ("point", *lines)),
-    )
+    """Return the only image of a file of labelme, whose shapes are CVAT's by other names."""
+    tags = {"point": "points", "line": "polyline", "linestrip": "polyline", "polygon": "polygon"}
+    tags |= {"rectangle": "box", "circle": "ellipse"}
+    shapes = []
+    for each in TypeAdapter(tuple[_Shape, ...]).validate_python(given["shapes"]):
+        places = ";".join(f"{x},{y}" for x, y in each.points)
+        shape = Element(tags.get(each.shape_type, "mask"), points=places)
+        shapes.append((each.label, shape))
+    size = str(given.get("imageWidth")), str(given.get("imageHeight"))
+    return _marked(str(given.get("imagePath", "")), size, shapes)
 
 
-def _require_known(given: object) -> None:
-    """Raise ContentError for files of VIA and Supervisely, with what can be given in their place.
-
-    VIA states no size of the images, and Supervisely not where in a pixel a place is.
-    """
-    parts = given if isinstance(given, dict) else {}
-    of_via = any(isinstance(part, dict) and "regions" in part for part in parts.values())
-    instead = "convert it to COCO keypoints with the names of the points"
-    if of_via or "_via_img_metadata" in parts:
-        raise ContentError(
-            f"a file of VIA (VGG Image Annotator), which has no image sizes; {instead}"
-        )
-    if {"objects", "size"} <= parts.keys():
-        raise ContentError(f"a file of Supervisely; {instead}")
+def _require_known(given: dict[str, Any]) -> None:
+    """Raise ContentError for a file that lacks image sizes, or where in a pixel its places are."""
+    nested = {key for part in given.values() if isinstance(part, dict) for key in part}
+    is_via = "regions" in nested or "_via_img_metadata" in given
+    if is_via or {"objects", "size"} <= given.keys():
+        program = "VIA, which states no image sizes" if is_via else "Supervisely"
+        raise ContentError(f"a file of {program}; convert it to COCO keypoints that have names")
 
 
 class _Share(Given):
