@@ -149,10 +149,7 @@ def _rise(stamps: Sequence[int | None]) -> bool:
 def read_packets(
     container: InputContainer, stream: VideoStream
 ) -> Iterator[av.Packet[VideoStream]]:
-    """Yield the packets of a stream; a truncated file ends where it was cut.
-
-    FFmpeg counts GXF in fields, and shows the last frame of two fields one field early.
-    """
+    """Yield the packets of a stream; a truncated file ends where it was cut."""
     packets = container.demux(stream)
     is_gxf, before = container.format.name == "gxf", None
     while True:
@@ -163,7 +160,7 @@ def read_packets(
         if packet is None:
             return
         if is_gxf and packet.pts is not None and packet.dts is not None:
-            if before is not None and packet.dts - before == 2:
+            if before is not None and packet.dts - before == 2:  # fields: the last comes one early
                 packet.pts += (packet.pts - packet.dts) % 2
             before = packet.dts
         yield packet

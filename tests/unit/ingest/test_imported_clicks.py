@@ -20,6 +20,7 @@ from worldpose.ingest.match_folder import read_match, read_spec
 from worldpose.ingest.pitch_file import read_pitch
 
 SIZE = (1920, 1080)
+SIDES = {"original_width": SIZE[0], "original_height": SIZE[1]}
 CLICKS = {"corner_left_near": (400.25, 900.5), "halfway_far": (960.0, 300.0)}
 LINE = [(100.0, 200.0), (300.0, 250.5)]
 
@@ -53,15 +54,14 @@ def cvat(file, clicks, lines=(), *, areas=(), name="east.png", size=SIZE):
 
 def label_studio(file, clicks, lines=()):
     percent = 100.0 / np.array(SIZE)
-    common = {"original_width": SIZE[0], "original_height": SIZE[1]}
     result = [{"type": "choices", "value": {"choices": ["good"]}}]
     for label, pixel in clicks:
         x, y = (np.array(pixel) + 0.5) * percent
         value = {"x": x, "y": y, "width": 0.4, "keypointlabels": [label]}
-        result.append({"type": "keypointlabels", "value": value, **common})
+        result.append({"type": "keypointlabels", "value": value, **SIDES})
     for label, pixels in lines:
         value = {"points": ((np.array(pixels) + 0.5) * percent).tolist(), "polygonlabels": [label]}
-        result.append({"type": "polygonlabels", "value": value, **common})
+        result.append({"type": "polygonlabels", "value": value, **SIDES})
     task = {"data": {"image": "/data/upload/east.png"}, "annotations": [{"result": result}]}
     file.write_text(json.dumps([task]))
     return file
@@ -159,8 +159,7 @@ def test_the_short_export_of_label_studio_gives_the_same_clicks(tmp_path):
     file = label_studio(tmp_path / "clicks", [*CLICKS.items()])
     (task,) = json.loads(file.read_text())
     given = task["annotations"][0]["result"][1:]
-    size = {"original_width": SIZE[0], "original_height": SIZE[1]}
-    short = {"image": "east.png", "id": 1, "kp": [each["value"] | size for each in given]}
+    short = {"image": "east.png", "id": 1, "kp": [each["value"] | SIDES for each in given]}
     for number, each in enumerate(([short], task)):  # and a task alone, as from the API
         file.write_text(json.dumps(each))
         import_clicks(file, match(tmp_path / f"m{number}"))
@@ -360,7 +359,6 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path, change, o
 
 
 KINDS = {"keypointlabels": "corner_left_near", "brushlabels": "halfway_line"}
-SIDES = {"original_width": 1920, "original_height": 1080}
 DRAWN = [{"type": k, "value": {"x": 50, "y": 50, k: [v]}, **SIDES} for k, v in KINDS.items()]
 TASK = {"data": {"image": "east.png"}, "annotations": [{"result": DRAWN}]}
 LEFT_OUT = {
@@ -369,20 +367,12 @@ LEFT_OUT = {
 label="center_circle"/><polygon label="adboard" points="1,2;3,4;5,6"/><polygon
 label="halfway_line" points="1.5,2.5;3.5,4.5"/></image></annotations>""",
     "studio.json": json.dumps([TASK]),
-    "coco.json": json.dumps(
-        {
-            "images": [{"id": 1, "file_name": "east.png", "width": 1920, "height": 1080}],
-            "annotations": [
-                {"image_id": 7, "category_id": 1, "keypoints": [1, 2, 2]},
-                {"image_id": 1, "category_id": 1, "keypoints": [100, 200, 2]},
-                {"image_id": 1, "category_id": 2, "segmentation": [[1, 2, 3, 4, 5, 6]]},
-            ],
-            "categories": [
-                {"id": 1, "name": "spot", "keypoints": ["corner_left_near"]},
-                {"id": 2, "name": "halfway_line"},
-            ],
-        }
-    ),
+    "coco.json": """{"images": [{"id": 1, "file_name": "east.png", "width": 1920, "height": 1080}],
+"annotations": [{"image_id": 7, "category_id": 1, "keypoints": [1, 2, 2]},
+{"image_id": 1, "category_id": 1, "keypoints": [100, 200, 2]}, {"image_id": 1, "category_id": 2,
+"segmentation": [[1, 2, 3, 4, 5, 6]]}], "categories":
+[{"id": 1, "name": "spot", "keypoints": ["corner_left_near"]},
+{"id": 2, "name": "halfway_line"}]}""",
 }
 
 

@@ -21,6 +21,12 @@ def numbered(count):
     return [np.full((*SIZE, 3), 10 + 4 * n, dtype=np.uint8) for n in range(count)]
 
 
+def mux(file, stream, pictures):
+    for picture in pictures:
+        file.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+    file.mux(stream.encode(None))
+
+
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory):
     path = tmp_path_factory.mktemp("video") / "clip.mp4"
@@ -60,9 +66,7 @@ def test_pixels_that_are_not_square_are_refused_with_their_ratio(tmp_path):
         stream = container.add_stream("libx264", 25)
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
         stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
-        for picture in numbered(2):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
-        container.mux(stream.encode())
+        mux(container, stream, numbered(2))
     with pytest.raises(InputError, match="square pixels, found a sample aspect ratio of 4:3"):
         index_frames(tmp_path / "clip.mp4")
 
@@ -123,10 +127,7 @@ def write_blocks(path, codec):
         size = (576, 720) if path.suffix == ".gxf" else SIZE  # GXF has those of television alone
         stream.height, stream.width, stream.pix_fmt = *size, pixels
         stream.codec_context.thread_count = 1
-        for number in range(40):
-            frame = av.VideoFrame.from_ndarray(blocks(number, *size), format="rgb24")
-            file.mux(stream.encode(frame))
-        file.mux(stream.encode(None))
+        mux(file, stream, [blocks(number, *size) for number in range(40)])
 
 
 @pytest.mark.parametrize(
@@ -269,11 +270,7 @@ def test_a_video_that_begins_before_its_first_key_frame_is_read_from_there(tmp_p
     with av.open(str(whole), "w") as target:
         stream = target.add_stream(codec, rate=25, options=options)
         stream.height, stream.width, stream.pix_fmt = *SIZE, "yuv420p"
-        for n, picture in enumerate(video_of_numbers(36)):
-            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
-            frame.pts, frame.time_base = n, Fraction(1, 25)
-            target.mux(stream.encode(frame))
-        target.mux(stream.encode(None))
+        mux(target, stream, video_of_numbers(36))
     with av.open(str(whole)) as source:
         packets = [packet for packet in source.demux(video=0) if packet.size]
         keys = [n for n, packet in enumerate(packets) if packet.is_keyframe]
@@ -295,10 +292,7 @@ def test_several_streams_of_video_are_refused(tmp_path):
         for stream in streams:
             stream.height, stream.width, stream.pix_fmt = *SIZE, "yuv420p"
         for stream in streams:
-            target.mux(
-                stream.encode(av.VideoFrame.from_ndarray(video_of_numbers(1)[0], format="rgb24"))
-            )
-            target.mux(stream.encode(None))
+            mux(target, stream, video_of_numbers(1))
     with pytest.raises(
         InputError, match="one video stream, found stream 0 of 64 x 48 px, stream 1"
     ):
