@@ -396,6 +396,7 @@ def test_shapes_that_are_not_read_are_counted(tmp_path, name, said):
     ("content", "said"),
     [(each, "CVAT") for each in ("", "<html></html>", "[1]", "{}", "{", "\udcff\udcfe")]
     + [
+        ("<annotations><image width='9' height='9'><mask/></image></annotations>", "but mask of"),
         ('{"_via_img_metadata": {}}', "VIA, which states no image sizes; convert it to COCO"),
         ('{"east.png123": {"filename": "east.png", "regions": []}}', "VIA"),
         ('{"size": {"height": 9, "width": 9}, "objects": []}', "Supervisely; convert it to COCO"),

@@ -83,7 +83,8 @@ def read_marked_images(path: Path) -> list[MarkedImage]:
         name = path.stem if path.stem.isdecimal() else "picture"
         found = [image if image.name else replace(image, name=name) for image in found]
         if not any(image.points or image.lines for image in found):
-            raise ContentError("no labelled point or line")
+            there = ", ".join(dict.fromkeys(each for image in found for each in image.left_out))
+            raise ContentError(f"no labelled point or line{there and f', but {there}'}"[:200])
         _require_pixels(found, per_cent=begin == b"[")
         return [image for image in found if image.points or image.lines or image.left_out]
 
@@ -364,8 +365,7 @@ def _read_labelme(given: dict[str, Any]) -> MarkedImage:
     shapes = []
     for each in TypeAdapter(tuple[_Shape, ...]).validate_python(given["shapes"]):
         places = ";".join(f"{x},{y}" for x, y in each.points)
-        shape = Element(tags.get(each.shape_type, "mask"), points=places)
-        shapes.append((each.label, shape))
+        shapes.append((each.label, Element(tags.get(each.shape_type, "mask"), points=places)))
     size = str(given.get("imageWidth")), str(given.get("imageHeight"))
     return _marked(str(given.get("imagePath", "")), size, shapes)
 
