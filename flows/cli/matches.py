@@ -77,8 +77,8 @@ def import_command(
             skel_3d/ and pitch_points.txt; writes OUT/<sequence> for each sequence.
         match_id: Id of the match; the folder's name by default.
         pitch: Survey of the markings (CSV); writes only pitch.json.
-        clicks: Clicks from CVAT (XML), Label Studio, COCO or SoccerNet (JSON). A label is the
-            name of a point or marking of the pitch, or a position in metres.
+        clicks: Clicks from CVAT (XML), Label Studio, labelme, COCO or SoccerNet (JSON). A label is
+            the name of a point or marking of the pitch, or a position in metres.
         camera: With --clicks, --lens or --camera-data: the camera, or the clip of the broadcast
             camera; by default, images and lenses are named after cameras.
         lens: Lens without a pose: OpenCV XML or YAML, ROS or Kalibr YAML, npz, OpenCap's

@@ -171,10 +171,8 @@ def require_poses(path: Path, cameras: Mapping[str, CameraCalibration]) -> None:
     if at_one and (len(cameras) > 1 or (is_lens and not centers.any())):
         found = "all cameras in one place" if len(cameras) > 1 else "one camera, at the origin"
         found += ": a calibration before the poses were found"
-        todo = (
-            "Import its lenses with worldpose import --lens FILE --out MATCH, and locate the "
-            "cameras by clicks or by worldpose locate-cameras."
-        )
+        todo = "Import its lenses with worldpose import --lens FILE --out MATCH, and locate the "
+        todo += "cameras by clicks or by worldpose locate-cameras."
         raise InputError(f"{path}: translation", "the poses of the cameras", found, todo)
 
 
@@ -213,9 +211,8 @@ def read_calibration_toml(
         table = _with_size(given, sizes.get(known_id(name, sizes)))
         if _has_lens_alone(table):
             expected = "the pose of the camera, rotation and translation"
-            todo = (
-                "Import lenses with worldpose import --lens FILE --out MATCH, and click the pose."
-            )
+            todo = "Import lenses with worldpose import --lens FILE --out MATCH, and click the "
+            todo += "pose."
             raise InputError(f"{where}.rotation", expected, "a lens alone", todo)
         cameras.append((where, read_camera_table(where, name, table, unit_m=unit_m)))
     return index_by_name(path, cameras)
@@ -367,11 +364,9 @@ def _read_lens(
         )
     if not fisheye and p > max_tangential:
         expected = f"k1 k2 p1 p2 k3 with p1 and p2 up to {max_tangential:g}"
-        todo = (
-            "If this is k1 k2 k3 k4 of a fisheye, say so in the file: fisheye = true in TOML, "
-            "fisheye_model: 1 in others. If it is k1 k2 k3 p1 p2, move k3 to the end. If it is "
-            "right, name its model: distortion_model = plumb_bob."
-        )
+        todo = "If this is k1 k2 k3 k4 of a fisheye, say so in the file: fisheye = true in TOML, "
+        todo += "fisheye_model: 1 in others. If it is k1 k2 k3 p1 p2, move k3 to the end. If it is "
+        todo += "right, name its model: distortion_model = plumb_bob."
         raise InputError(where, expected, str(numbers.tolist()), todo)
     return np.append(numbers, 0.0)[: len(names)], model
 

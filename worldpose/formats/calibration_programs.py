@@ -47,7 +47,8 @@ def read_camera_json(path: Path, left_out: LeftOut | None) -> dict[str, CameraCa
     if isinstance(content, dict) and cameras is None and content:
         tables = {name: one for name, one in content.items() if isinstance(one, dict)}
         if len(tables) == len(content) and all("K" in one for one in tables.values()):
-            keys = Keys("image_size", "K", "dist", "R", "t")
+            shift = "t" if any("t" in one for one in tables.values()) else "T"
+            keys = Keys("image_size", "K", "dist", "R", shift)
             return _read_tables(path, tables, keys, left_out)
     raise calibration_error(
         f"{path}: cameras",
@@ -161,10 +162,8 @@ def _read_tables(
         left_out.update({camera_id(name): "it has no pose" for name in tables if name not in posed})
     elif len(posed) < len(tables) or not posed:
         lacking = next((name for name in tables if name not in posed), "no camera")
-        todo = (
-            "Calibrate the poses too; or import the lenses (worldpose import --lens FILE), "
-            "and click the poses."
-        )
+        todo = "Calibrate the poses too; or import the lenses (worldpose import --lens FILE), "
+        todo += "and click the poses."
         raise InputError(f"{path}: {lacking}", "the pose of the camera", "a lens alone", todo)
     cameras = []
     for name in posed:

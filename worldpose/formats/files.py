@@ -104,7 +104,8 @@ def read_yaml(path: Path) -> Any:  # noqa: ANN401
 
 def parse_yaml(where: str, text: str) -> Any:  # noqa: ANN401
     """Return the only document of a YAML text, as `read_yaml`; `where` names it in errors."""
-    return _parse(where, "YAML", _load_yaml, text)
+    # ROS prints the mark of a next document after each one.
+    return _parse(where, "YAML", _load_yaml, re.sub(r"\n---\s*\Z", "\n", text))
 
 
 def read_json(path: Path, limit: int = SETTINGS_BYTES) -> Any:  # noqa: ANN401

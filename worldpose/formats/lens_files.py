@@ -102,16 +102,20 @@ def read_lenses(
     matrix = _pick(where, given, MATRIX_NAMES, usual)
     usual = "distortion coefficients, named distortion_coefficients, dist_coeffs, dist or D"
     distortion = np.ravel(_pick(where, given, DISTORTION_NAMES, usual))
+    own, roi = _image_size(given), given.get("roi")
     try:
         matrix, distortion = matrix.astype(np.float64), distortion.astype(np.float64)
-    except (ValueError, TypeError) as error:
+        matrix = matrix.reshape(3, 3) if matrix.size == 9 else matrix
+        if isinstance(roi, Mapping) and "x_offset" in roi and _image_size(roi):
+            own = _image_size(roi)  # of ROS: the images show this part of the sensor
+            matrix[:2, 2] -= [roi["x_offset"], roi["y_offset"]]
+    except (ValueError, TypeError, LookupError) as error:
         raise calibration_error(where, "matrices of numbers", say_failure(error)) from error
     if "xi" in given:
         raise calibration_error(f"{where}: xi", "a pinhole or fisheye lens", "that of cv2.omnidir")
-    own = _image_size(given)
     table = {
         "size": list(own or sizes[camera]),
-        "matrix": (matrix.reshape(3, 3) if matrix.shape == (9,) else matrix).tolist(),
+        "matrix": matrix.tolist(),
         "distortions": distortion.tolist(),
         **{key: value for key, value in given.items() if tells_model(key)},
     }
@@ -365,7 +369,7 @@ def _read_mapping(file: Path) -> dict[str, Any]:
                 expected = "data of rows x cols numbers"
                 raise calibration_error(f"{file}: {name}", expected, ", ".join(parts)) from error
         elif isinstance(value, list | int | float | str) or plain_key(str(name)) in {
-            *chain(*SIZE_NAMES)
+            *("roi", *chain(*SIZE_NAMES))
         }:
             found[str(name)] = value
     return found
@@ -483,17 +487,13 @@ def _scale(where: str, size: Floats, own: tuple[int, int]) -> float:
     scale = np.array(own) / size
     if abs(scale[0] - scale[1]) > 0.002 * scale[0]:
         expected = f"{own[0]} x {own[1]} px, the camera's images, or the same shape"
-        todo = (
-            "Give a lens that was calibrated in images of the video's shape: a crop has "
-            "another principal point."
-        )
+        todo = "Give a lens that was calibrated in images of the video's shape: a crop has another "
+        todo += "principal point."
         raise InputError(f"{where}: size", expected, f"{size[0]:g} x {size[1]:g}", todo)
     return float(scale[0])
 
 
 def _unknown_camera(where: str, name: str, sizes: Mapping[str, object]) -> InputError:
-    todo = (
-        "Rename the cameras in the file as in match.yaml; --camera NAME then reads one alone, and "
-        "the others may have any name."
-    )
+    todo = "Rename the cameras in the file as in match.yaml; --camera NAME then reads one alone, "
+    todo += "and the others may have any name."
     return InputError(where, f"a static camera of match.yaml: {', '.join(sizes)}", repr(name), todo)

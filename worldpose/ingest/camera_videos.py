@@ -23,8 +23,11 @@ from worldpose.video.names import VIDEO_SUFFIXES, is_video
 from worldpose.video.pictures import FrameIndex
 from worldpose.video.recordings import describe_video, join_videos
 
-_CHAPTER: Final = re.compile(r"(.*)(?:(G[HXLS]|GP)(\d\d)|GOPR)(\d{4})", re.IGNORECASE)
-"""GoPro's names: GX020017 is chapter 2 of recording 17, GP010017 that after GOPR0017."""
+_CHAPTER: Final = re.compile(
+    r"(.*)(?:(?:(G[HXLS]|GP)(\d\d)|GOPR)(\d{4})|(VTS)_(\d\d)_([1-9]))", re.IGNORECASE
+)
+"""Names of GoPro and DVDs: GX020017 is chapter 2 of recording 17, GP010017 that after GOPR0017,
+and VTS_01_2 part 2 of title set 1."""
 
 
 def find_videos(
@@ -133,22 +136,26 @@ def _recordings(files: Sequence[Path]) -> list[list[Path]]:
     """Return the chapters of each recording in order; other videos are alone."""
     found: dict[tuple[str, ...], list[tuple[int, Path]]] = {}
     for file in files:
-        chapter = _CHAPTER.fullmatch(file.stem)
-        key: tuple[str, ...] = (file.name,)
-        number = 0
-        if chapter is not None:
-            kind = (chapter[2] or "GP").upper()  # GOPR0017 begins what GP010017 continues
-            key, number = (chapter[1], kind, chapter[4]), int(chapter[3] or 0)
-        found.setdefault(key, []).append((number, file))
+        *key, number = _chapter(file) or (file.name, 0)
+        found.setdefault(tuple(map(str, key)), []).append((int(number), file))
     return [[file for _, file in sorted(group)] for group in found.values()]
+
+
+def _chapter(file: Path) -> tuple[str, str, str, int] | None:
+    """Return what names a chapter's recording, and the chapter's number; None for other videos."""
+    chapter = _CHAPTER.fullmatch(file.stem)
+    if chapter is None:
+        return None
+    before, kind, number, recording, title, title_number, part = chapter.groups()
+    kind = (kind or title or "GP").upper()  # GOPR0017 begins what GP010017 continues
+    return before, kind, recording or title_number, int(number or part or 0)
 
 
 def _is_whole(group: Sequence[Path]) -> bool:
     """Return whether a recording has its first chapter, and those up to its last."""
-    chapters = [_CHAPTER.fullmatch(file.stem) for file in group]
-    numbers = [int(each[3] or 0) for each in chapters if each is not None]
-    first = 0 if (chapters[0] and (chapters[0][2] or "GP").upper() == "GP") else 1
-    return numbers == list(range(first, first + len(numbers)))
+    chapters = [each for each in map(_chapter, group) if each is not None]
+    first = 0 if chapters[0][1] == "GP" else 1
+    return [each[3] for each in chapters] == list(range(first, first + len(chapters)))
 
 
 def _chapters_error(folder: Path, group: Sequence[Path]) -> InputError:

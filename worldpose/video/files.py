@@ -118,7 +118,8 @@ def _count_frames(
     """Return the index of a video whose packets do not say when each frame is shown."""
     shown = _shown_stamps(path)
     if len(shown) != count:
-        raise no_video(path, f"{count} pictures without their order, {len(shown)} can be decoded")
+        found = f"{count} pictures, of which {len(shown)} can be decoded, not all with time stamps"
+        raise no_video(path, found + ": does it begin or end within a group of pictures?")
     stamps = np.sort(np.array(given, dtype=np.int64))
     if len(np.unique(stamps)) < count:
         known = np.array([number for number, stamp in enumerate(shown) if stamp is not None])
@@ -150,6 +151,7 @@ def read_packets(
 ) -> Iterator[av.Packet[VideoStream]]:
     """Yield the packets of a stream; a truncated file ends where it was cut."""
     packets = container.demux(stream)
+    is_gxf, before = container.format.name == "gxf", None
     while True:
         try:
             packet = next(packets, None)
@@ -157,6 +159,10 @@ def read_packets(
             return
         if packet is None:
             return
+        if is_gxf and packet.pts is not None and packet.dts is not None:
+            if before is not None and packet.dts - before == 2:  # fields: the last comes one early
+                packet.pts += (packet.pts - packet.dts) % 2
+            before = packet.dts
         yield packet
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -28,6 +29,14 @@ def join_videos(parts: Sequence[Path], out: Path) -> None:
     Raises:
         InputError: no video, chapters that differ, or a file that does not hold all frames.
     """
+    if parts[0].suffix.lower() == ".vob":  # parts of one stream, cut between any two packets
+        index_frames(parts[0])  # what is wrong with all of them is said of a file of the user
+        with out.open("wb") as whole:
+            for part in parts:
+                with part.open("rb") as source_bytes:
+                    shutil.copyfileobj(source_bytes, whole)
+        index_frames(out)
+        return
     indices = [index_frames(part) for part in parts]
     base = indices[0].time_base
     written: VideoStream | None = None
@@ -44,7 +53,10 @@ def join_videos(parts: Sequence[Path], out: Path) -> None:
                     packet.pts += begin - int(index.stamps[0])
                     packet.dts += begin - int(index.stamps[0])
                     packet.stream = written
-                    target.mux(packet)
+                    try:
+                        target.mux(packet)
+                    except av.error.FFmpegError:  # times that this kind of file cannot have
+                        break
             step = round(float(np.median(np.diff(index.stamps)))) if len(index) > 1 else 1
             begin += int(index.stamps[-1] - index.stamps[0]) + step
     count, joined = sum(map(len, indices)), index_frames(out)

@@ -293,11 +293,16 @@ def test_entries_that_contradict_or_lack_a_name_are_refused(content, said, tmp_p
         read_lenses([tmp_path / "lens.json"], "left", SIZES)
 
 
-@pytest.mark.parametrize("names", ["KDhw", "kd"])
-def test_the_nine_numbers_and_the_size_of_a_camera_info_are_read(names, tmp_path):
+@pytest.mark.parametrize(
+    ("names", "width", "height"), [("KD", 0, 0), ("kd", 0, 0), ("KD", 320, 180)]
+)
+def test_the_nine_numbers_and_the_size_of_a_camera_info_are_read(names, width, height, tmp_path):
     half = np.diag([0.5, 0.5, 1.0]) @ MATRIX
-    text = f"height: 540\nwidth: 960\n{names[0]}: {half.ravel().tolist()}\n"
-    (tmp_path / "info.yaml").write_text(text + f"{names[1]}: {DISTORTION[0].tolist()}\n")
+    half[:2, 2] += [width, height]  # the images show the corner of a larger sensor
+    text = f"height: {540 + height}\nwidth: {960 + width}\n{names[0]}: {half.ravel().tolist()}\n"
+    text += f"roi: {{x_offset: {width}, y_offset: {height}, height: 540, width: 960}}\n"
+    text += f"{names[1]}: {DISTORTION[0].tolist()}\n---\n"
+    (tmp_path / "info.yaml").write_text(text)
     lens = read_lenses([tmp_path / "info.yaml"], "left", SIZES)["left"]
     assert lens.focal_px == pytest.approx(1402.0)
     assert lens.principal_point_px == pytest.approx((970.5, 530.5))

@@ -231,10 +231,10 @@ def write_multical(folder, cameras):
     return path
 
 
-def write_plain(folder, cameras):
+def write_plain(folder, cameras, shift="t"):
     """Write OpenCV's numbers of each camera, as many scripts of researchers do."""
     tables = {
-        one.id: {"K": matrix(one).tolist(), "R": one.rotation, "t": one.translation}
+        one.id: {"K": matrix(one).tolist(), "R": one.rotation, shift: one.translation}
         | {"dist": one.distortion, "image_size": SIZE}
         for one in cameras
     }
@@ -281,4 +281,5 @@ WRITERS = {
     "Panoptic": write_panoptic,
     "multical": write_multical,
     "K R t": write_plain,
+    "K R T": lambda folder, cameras: write_plain(folder, cameras, "T"),
 }

@@ -20,6 +20,7 @@ from worldpose.ingest.match_folder import read_match, read_spec
 from worldpose.ingest.pitch_file import read_pitch
 
 SIZE = (1920, 1080)
+SIDES = {"original_width": SIZE[0], "original_height": SIZE[1]}
 CLICKS = {"corner_left_near": (400.25, 900.5), "halfway_far": (960.0, 300.0)}
 LINE = [(100.0, 200.0), (300.0, 250.5)]
 
@@ -27,10 +28,7 @@ LINE = [(100.0, 200.0), (300.0, 250.5)]
 def match(folder, *, pitch=None):
     folder.mkdir()
     lines = ["contract: 1", "match_id: m", "fps: 25", "cameras:"]
-    lines += [
-        "  - {id: east, width: 1920, height: 1080}",
-        "  - {id: west, width: 1920, height: 1080}",
-    ]
+    lines += [f"  - {{id: {name}, width: 1920, height: 1080}}" for name in ("east", "west")]
     lines += ["  - {id: main, width: 1920, height: 1080, kind: broadcast}", "clips:"]
     lines += ["  - {id: goal, first_frame: 0, frame_count: 50, broadcast: main}"]
     (folder / "match.yaml").write_text("\n".join(lines) + "\n")
@@ -56,15 +54,14 @@ def cvat(file, clicks, lines=(), *, areas=(), name="east.png", size=SIZE):
 
 def label_studio(file, clicks, lines=()):
     percent = 100.0 / np.array(SIZE)
-    common = {"original_width": SIZE[0], "original_height": SIZE[1]}
     result = [{"type": "choices", "value": {"choices": ["good"]}}]
     for label, pixel in clicks:
         x, y = (np.array(pixel) + 0.5) * percent
         value = {"x": x, "y": y, "width": 0.4, "keypointlabels": [label]}
-        result.append({"type": "keypointlabels", "value": value, **common})
+        result.append({"type": "keypointlabels", "value": value, **SIDES})
     for label, pixels in lines:
         value = {"points": ((np.array(pixels) + 0.5) * percent).tolist(), "polygonlabels": [label]}
-        result.append({"type": "polygonlabels", "value": value, **common})
+        result.append({"type": "polygonlabels", "value": value, **SIDES})
     task = {"data": {"image": "/data/upload/east.png"}, "annotations": [{"result": result}]}
     file.write_text(json.dumps([task]))
     return file
@@ -82,6 +79,17 @@ def coco(file, clicks):
     return file
 
 
+def labelme(file, clicks, lines=()):
+    marked = [("point", label, [at]) for label, at in clicks] + [("line", *a) for a in lines]
+    shapes = [
+        {"label": label, "shape_type": kind, "points": (np.array(at) + 0.5).tolist()}
+        for kind, label, at in marked
+    ]
+    about = {"imagePath": "..\\img\\east.png", "imageWidth": SIZE[0], "imageHeight": SIZE[1]}
+    file.write_text(json.dumps({"version": "5.5.0", "shapes": shapes, "imageData": None, **about}))
+    return file
+
+
 def clicked(folder, camera="east"):
     spec = read_spec(folder)
     file = folder / "annotations" / "static_calibration" / f"{camera}.json"
@@ -89,7 +97,7 @@ def clicked(folder, camera="east"):
     return {point.name: point.xy for point in found.points}, found.drawn
 
 
-@pytest.mark.parametrize("write", [cvat, label_studio, coco])
+@pytest.mark.parametrize("write", [cvat, label_studio, labelme, coco])
 def test_every_form_gives_the_same_clicks(tmp_path, write):
     folder = match(tmp_path / "m")
     lines = [] if write is coco else [("touch_line_near", LINE)]
@@ -151,8 +159,7 @@ def test_the_short_export_of_label_studio_gives_the_same_clicks(tmp_path):
     file = label_studio(tmp_path / "clicks", [*CLICKS.items()])
     (task,) = json.loads(file.read_text())
     given = task["annotations"][0]["result"][1:]
-    size = {"original_width": SIZE[0], "original_height": SIZE[1]}
-    short = {"image": "east.png", "id": 1, "kp": [each["value"] | size for each in given]}
+    short = {"image": "east.png", "id": 1, "kp": [each["value"] | SIDES for each in given]}
     for number, each in enumerate(([short], task)):  # and a task alone, as from the API
         file.write_text(json.dumps(each))
         import_clicks(file, match(tmp_path / f"m{number}"))
@@ -351,48 +358,21 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path, change, o
     assert {each.name for each in folder.iterdir()} == {"match.yaml"}
 
 
+KINDS = {"keypointlabels": "corner_left_near", "brushlabels": "halfway_line"}
+DRAWN = [{"type": k, "value": {"x": 50, "y": 50, k: [v]}, **SIDES} for k, v in KINDS.items()]
+TASK = {"data": {"image": "east.png"}, "annotations": [{"result": DRAWN}]}
 LEFT_OUT = {
     "cvat.xml": """<annotations><image name="east.png" width="1920" height="1080">
-<points label="corner_left_near" points="100.5,200.5"/><box label="b"/>
-<polygon label="adboard" points="1,2;3,4;5,6"/><ellipse label="center_circle"/>
-<polygon label="halfway_line" points="1.5,2.5;3.5,4.5"/></image></annotations>""",
-    "studio.json": json.dumps(
-        [
-            {
-                "data": {"image": "east.png"},
-                "annotations": [
-                    {
-                        "result": [
-                            {
-                                "type": kind,
-                                "original_width": 1920,
-                                "original_height": 1080,
-                                "value": {"x": 50, "y": 50, kind: [label]},
-                            }
-                            for kind, label in (
-                                ("keypointlabels", "corner_left_near"),
-                                ("brushlabels", "halfway_line"),
-                            )
-                        ]
-                    }
-                ],
-            }
-        ]
-    ),
-    "coco.json": json.dumps(
-        {
-            "images": [{"id": 1, "file_name": "east.png", "width": 1920, "height": 1080}],
-            "annotations": [
-                {"image_id": 7, "category_id": 1, "keypoints": [1, 2, 2]},
-                {"image_id": 1, "category_id": 1, "keypoints": [100, 200, 2]},
-                {"image_id": 1, "category_id": 2, "segmentation": [[1, 2, 3, 4, 5, 6]]},
-            ],
-            "categories": [
-                {"id": 1, "name": "spot", "keypoints": ["corner_left_near"]},
-                {"id": 2, "name": "halfway_line"},
-            ],
-        }
-    ),
+<points label="corner_left_near" points="100.5,200.5"/><box label="b"/><ellipse
+label="center_circle"/><polygon label="adboard" points="1,2;3,4;5,6"/><polygon
+label="halfway_line" points="1.5,2.5;3.5,4.5"/></image></annotations>""",
+    "studio.json": json.dumps([TASK]),
+    "coco.json": """{"images": [{"id": 1, "file_name": "east.png", "width": 1920, "height": 1080}],
+"annotations": [{"image_id": 7, "category_id": 1, "keypoints": [1, 2, 2]},
+{"image_id": 1, "category_id": 1, "keypoints": [100, 200, 2]}, {"image_id": 1, "category_id": 2,
+"segmentation": [[1, 2, 3, 4, 5, 6]]}], "categories":
+[{"id": 1, "name": "spot", "keypoints": ["corner_left_near"]},
+{"id": 2, "name": "halfway_line"}]}""",
 }
 
 
@@ -412,10 +392,19 @@ def test_shapes_that_are_not_read_are_counted(tmp_path, name, said):
     assert report.clicks == {"east": 2 if name == "cvat.xml" else 1}
 
 
-@pytest.mark.parametrize("content", [b"", b"<html></html>", b"[1]", b"{}", b"{", b"\xff\xfe"])
-def test_other_files_are_refused(tmp_path, content):
-    (tmp_path / "c").write_bytes(content)
-    with pytest.raises(InputError, match="labelled points of CVAT"):
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [(each, "CVAT") for each in ("", "<html></html>", "[1]", "{}", "{", "\udcff\udcfe")]
+    + [
+        ("<annotations><image width='9' height='9'><mask/></image></annotations>", "but mask of"),
+        ('{"_via_img_metadata": {}}', "VIA, which states no image sizes; convert it to COCO"),
+        ('{"east.png123": {"filename": "east.png", "regions": []}}', "VIA"),
+        ('{"size": {"height": 9, "width": 9}, "objects": []}', "Supervisely; convert it to COCO"),
+    ],
+)
+def test_other_files_are_refused(tmp_path, content, said):
+    (tmp_path / "c").write_bytes(content.encode(errors="surrogateescape"))
+    with pytest.raises(InputError, match=f"labelled points of .*{said}"):
         read_marked_images(tmp_path / "c")
 
 

@@ -14,7 +14,7 @@ from worldpose.ingest.match_folder import read_match
 from worldpose.video.files import VideoReader, write_video
 from worldpose.video.folder import median_picture, open_video
 from worldpose.video.pictures import FrameIndex
-from worldpose.video.recordings import describe_video
+from worldpose.video.recordings import describe_video, join_videos
 
 SIZE = (48, 64)
 
@@ -140,6 +140,22 @@ def encode(path, count=30, options=None, name="libx264"):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
         container.mux(stream.encode(None))
     return path
+
+
+def test_parts_of_a_dvd_are_joined_as_one_stream(tmp_path):
+    whole = encode(tmp_path / "whole.vob", 100, {"g": "12", "bf": "2"}, "mpeg2video").read_bytes()
+    (tmp_path / "videos" / "cam1").mkdir(parents=True)
+    cut = len(whole) - 2048
+    for number, content in enumerate((b"menu", whole[:cut], whole[cut:])):
+        (tmp_path / "videos" / "cam1" / f"VTS_01_{number}.VOB").write_bytes(content)
+    with pytest.raises(InputError, match=r"one recording: VTS_01_1\.VOB, VTS_01_2\.VOB"):
+        find_videos(tmp_path / "videos")
+    found = find_videos(tmp_path / "videos", tmp_path)
+    assert found["cam1"].read_bytes() == whole
+    files = sorted((tmp_path / "videos" / "cam1").glob("*[12].VOB"))
+    parts = [file.rename(file.with_suffix(".mpg")) for file in files]
+    with pytest.raises(InputError, match="expected chapters of one recording"):
+        join_videos(parts, tmp_path / "joined.mpg")
 
 
 def test_interlaced_fields_are_said_and_progressive_frames_are_not(tmp_path):

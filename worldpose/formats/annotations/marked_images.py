@@ -1,4 +1,4 @@
-"""Clicked points and drawn lines of images in files of CVAT, Label Studio, COCO and SoccerNet.
+"""Clicked points and drawn lines in files of CVAT, Label Studio, labelme, COCO and SoccerNet.
 
 CVAT for video gives the images of its key frames; what it interpolates between them is no click.
 
@@ -68,7 +68,7 @@ class MarkedImage:
 
 
 def read_marked_images(path: Path) -> list[MarkedImage]:
-    """Return images with shapes of CVAT, Label Studio, COCO, SoccerNet; InputError without any."""
+    """Return images with shapes of the programs above; InputError without any."""
     max_bytes = 1 << 26  # maximum file size [bytes]
 
     def decode(content: bytes) -> list[MarkedImage]:
@@ -83,11 +83,13 @@ def read_marked_images(path: Path) -> list[MarkedImage]:
         name = path.stem if path.stem.isdecimal() else "picture"
         found = [image if image.name else replace(image, name=name) for image in found]
         if not any(image.points or image.lines for image in found):
-            raise ContentError("no labelled point or line")
+            there = ", ".join(dict.fromkeys(each for image in found for each in image.left_out))
+            raise ContentError(f"no labelled point or line{there and f', but {there}'}"[:200])
         _require_pixels(found, per_cent=begin == b"[")
         return [image for image in found if image.points or image.lines or image.left_out]
 
-    expected = "labelled points of CVAT (XML 1.1), Label Studio or COCO, or SoccerNet's lines"
+    expected = "labelled points of CVAT (XML 1.1), Label Studio, labelme or COCO, or SoccerNet's "
+    expected += "lines"
     todo = "Export the clicks from the annotator in one of these forms."
     return decode_file(path, max_bytes, decode, expected, todo)
 
@@ -314,6 +316,10 @@ def _read_coco(content: bytes) -> Iterator[MarkedImage]:
     if isinstance(given, dict) and "data" in given and "images" not in given:
         yield from _read_label_studio(json.dumps([given]).encode())
         return
+    if "shapes" in given:
+        yield _read_labelme(given)
+        return
+    _require_known(given)
     if isinstance(given, dict) and isinstance(given.get("annotations"), list):
         marked = [each for each in given["annotations"] if isinstance(each, dict)]
         if any(isinstance(each.get("lines"), dict) for each in marked):
@@ -344,6 +350,33 @@ def _read_coco(content: bytes) -> Iterator[MarkedImage]:
                     points.append((label, np.array([x, y])))
         size = image.width, image.height
         yield MarkedImage(image.file_name, size, tuple(points), (), left_out=tuple(left_out))
+
+
+class _Shape(Given):
+    label: str
+    shape_type: str = "polygon"
+    points: tuple[tuple[float, float], ...]
+
+
+def _read_labelme(given: dict[str, Any]) -> MarkedImage:
+    """Return the only image of a file of labelme, whose shapes are CVAT's by other names."""
+    tags = {"point": "points", "line": "polyline", "linestrip": "polyline", "polygon": "polygon"}
+    tags |= {"rectangle": "box", "circle": "ellipse"}
+    shapes = []
+    for each in TypeAdapter(tuple[_Shape, ...]).validate_python(given["shapes"]):
+        places = ";".join(f"{x},{y}" for x, y in each.points)
+        shapes.append((each.label, Element(tags.get(each.shape_type, "mask"), points=places)))
+    size = str(given.get("imageWidth")), str(given.get("imageHeight"))
+    return _marked(str(given.get("imagePath", "")), size, shapes)
+
+
+def _require_known(given: dict[str, Any]) -> None:
+    """Raise ContentError for a file that lacks image sizes, or where in a pixel its places are."""
+    nested = {key for part in given.values() if isinstance(part, dict) for key in part}
+    is_via = "regions" in nested or "_via_img_metadata" in given
+    if is_via or {"objects", "size"} <= given.keys():
+        program = "VIA, which states no image sizes" if is_via else "Supervisely"
+        raise ContentError(f"a file of {program}; convert it to COCO keypoints that have names")
 
 
 class _Share(Given):
