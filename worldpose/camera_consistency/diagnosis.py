@@ -196,26 +196,17 @@ class Diagnosis:
         others = [p for p in core if p != c]
         people = self.comparison.people(others) if len(others) > 1 else None
         hypothesis = trial.hypothesis
-        found = Fault(
-            c,
-            hypothesis.kind,
-            hypothesis.detail,
-            hypothesis.value,
-            hypothesis.source,
-            share_corrected=None,
-        )
+        kind, source = hypothesis.kind, hypothesis.source
+        found = Fault(c, kind, hypothesis.detail, hypothesis.value, source)
         if people is not None:
             now, corrected = (
                 self.comparison.shares(c, each, people)[0] for each in (STATED, hypothesis)
             )
             found = replace(found, share_now=now, share_corrected=corrected)
         own = int((self.agreement[c] > 4.0 * self.deviation[c]).sum()) + 1
-        alone = len(others) == 1 and hypothesis.kind != "swapped"
+        alone = len(others) == 1 and kind != "swapped"
         if alone or (c not in core and own >= len(others) > 1):
-            cause, source = hypothesis.kind, hypothesis.source
-            found = replace(
-                found, kind="contradiction", other=others[0], cause=cause, source=source
-            )
+            found = replace(found, kind="contradiction", other=others[0], cause=kind, source=source)
         self.faults.append(found)
 
     # -- faults of cameras that agree with no others -----------------------------------------
