@@ -23,6 +23,7 @@ from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.from_paint.proposal import propose_camera
 from worldpose.static_calibration.settings import ProposalSettings, StaticCalibrationSettings
+from worldpose.static_calibration.sides import place_at
 from worldpose.store.writer import ResultWriter
 from worldpose.tracking.plane.feet import locate_feet
 from worldpose.video.folder import open_video
@@ -76,7 +77,7 @@ def _find_camera(
         given = CameraCalibration.model_validate(sources["calibration"])
         return Camera.from_calibration(given), {"origin": "given"}
     assert pitch is not None  # registration requires it
-    lens = given_lens(sources)
+    lens, side = given_lens(sources), sources["side"]
     if sources["clicked"]:
         ((file, clicked),) = sources["clicked"].items()
         calibration = calibrate_camera(
@@ -86,9 +87,9 @@ def _find_camera(
             settings=StaticCalibrationSettings(prior=settings.prior, lines=False),
             where=file,
             lens=lens,
+            start=side and place_at(side),
         )
         return calibration.estimate.camera, {"origin": "points"}
-    side = sources["side"]
     proposed = propose_camera(
         require_picture(inputs.unit, open_still(inputs)),
         pitch,

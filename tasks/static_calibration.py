@@ -34,7 +34,7 @@ from worldpose.static_calibration.report import (
     uncalibrated_attributes,
 )
 from worldpose.static_calibration.settings import StaticCalibrationSettings
-from worldpose.static_calibration.sides import SeenPeople, decide_sides
+from worldpose.static_calibration.sides import SeenPeople, decide_sides, place_at
 from worldpose.store.writer import ResultWriter
 from worldpose.video.folder import index_video, median_picture, open_video, some_pictures
 
@@ -90,7 +90,7 @@ def _calibrate(inputs: UnitInputs) -> StaticCalibration:
     settings = inputs.settings(StaticCalibrationSettings)
     if sources["clicked"]:
         ((file, clicked),) = sources["clicked"].items()
-        width, height = sources["image_size"]
+        (width, height), side = sources["image_size"], sources.get("side")
         by_paper = settings.method == "paper"
         found = calibrate_camera(
             pitch,
@@ -100,6 +100,7 @@ def _calibrate(inputs: UnitInputs) -> StaticCalibration:
             settings=settings.model_copy(update={"method": "worldpose"}),
             where=file,
             lens=lens,
+            start=side and place_at(side),
         )
         if by_paper:
             require_torch()

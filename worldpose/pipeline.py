@@ -32,6 +32,7 @@ from worldpose.ingest.match_folder import MatchFolder
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.report import StaticCalibration
+from worldpose.static_calibration.sides import place_at
 from worldpose.tracking.tracker import Tracking, track_people
 from worldpose.triangulation.estimate import reconstruct_joints
 from worldpose.triangulation.limb_lengths import undo_swaps
@@ -108,7 +109,9 @@ def calibrate_static_cameras(match: MatchFolder, pitch: PitchTemplate) -> list[S
         size, still = (spec.width, spec.height), match.stills.get(spec.id)
         picture = None if still is None else read_still(still, size)
         clicks, lens = match.clicked[spec.id], match.lenses.get(spec.id)
-        calibrations.append(calibrate_camera(pitch, clicks, size, picture=picture, lens=lens))
+        start = spec.side and place_at(spec.side)
+        found = calibrate_camera(pitch, clicks, size, picture=picture, lens=lens, start=start)
+        calibrations.append(found)
     return calibrations
 
 

@@ -58,7 +58,7 @@ def needed_proposals(match: Match, unit: str) -> tuple[str, ...]:
 
 
 def camera_sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """Return the given calibration alone, or else clicks, pitch, lens and an image of the camera.
+    """Return the given calibration alone, or else clicks, side, pitch, lens and an image.
 
     Clicks are listed under the file's name, by marking, so that a difference between two runs names
     the file and the point.
@@ -74,6 +74,7 @@ def camera_sources(match: Match, unit: str) -> dict[str, JsonValue]:
         "calibration": None,
         **({} if lens is None else {"lens": lens.model_dump(mode="json")}),
         "clicked": {} if clicked is None else {clicked_file(unit): clicked.by_name()},
+        **({} if clicked is None or camera.side is None else {"side": camera.side}),
         "pitch": match.pitch_source,
         "image_size": [camera.width, camera.height],
         **match.file_sources("still", still),

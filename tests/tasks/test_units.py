@@ -8,6 +8,8 @@ import tomllib
 
 import numpy as np
 import pytest
+import yaml
+from camera_builders import look_at_camera
 from prefect.states import Failed
 
 from flows.match import task_of
@@ -20,8 +22,10 @@ from tasks.static_calibration import static_calibration
 from tasks.unit import unit_task
 from worldpose.errors import CorruptionError, InputError, StoreError, WorldposeError
 from worldpose.formats.release_cameras import read_camera
+from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.ingest.importing import import_lenses
 from worldpose.ingest.match_folder import read_match
+from worldpose.pitch.template import PitchTemplate
 from worldpose.store.recipes import recipe_differences
 from worldpose.store.store import Store
 
@@ -137,6 +141,29 @@ def test_a_moved_click_reaches_its_camera_and_what_sees_through_it_alone(clicked
     reason = str(difference)
     assert f"annotations/static_calibration/{file.name}.points.{point['name']}[0]: " in reason
     assert reason.endswith(f" -> {point['xy'][0]}")
+
+
+def test_a_stated_side_decides_clicks_that_both_sides_see_alike(clicked):
+    store, match, _ = clicked
+    folder, camera = match.folder.folder, look_at_camera((0, -75, 18), (0, 0, 0), 2100.0)
+    shutil.rmtree(folder / "reference")
+    spec, drawn, found = yaml.safe_load((folder / "match.yaml").read_text()), [], {}
+    for name in ("center_circle", "halfway_line"):
+        pixels = camera.project(PitchTemplate.standard().marking_points(name, 2.0))
+        inside = ((pixels > 0.0) & (pixels < camera.image_size - 1.0)).all(axis=1)
+        drawn.append({"name": name, "xy": pixels[inside].tolist()})
+    clicks = folder / "annotations" / "static_calibration" / "cam00.json"
+    clicks.write_text(json.dumps(json.loads(clicks.read_text()) | {"points": [], "drawn": drawn}))
+    for side in (None, "near", "far"):
+        spec["cameras"][0] |= {"width": 1920, "height": 1080, "side": side}
+        (folder / "match.yaml").write_text(yaml.safe_dump(spec))
+        match, _ = register(store, folder)
+        unit = next(u for u in plan_run(store, match, {}) if u.name == "static_calibration/cam00")
+        static_calibration.fn(unit.work(store.url, match, "0001"))
+        stored = store.open_result(match.match_id, "static_calibration", "cam00", unit.key)
+        center = camera_from_arrays(stored.data_vars).center if stored.data_vars else np.zeros(3)
+        found[side] = np.sign(np.ravel(center)[1])
+    assert found == {None: 0.0, "near": -1.0, "far": 1.0}
 
 
 def test_a_given_camera_wins_over_clicks(clicked, tmp_path):

@@ -81,13 +81,13 @@ def test_the_pipeline_has_the_order_of_the_method():
     assert order == [stage.name for stage in METHOD if stage.name in order]
 
 
-def test_the_pipeline_calibrates_with_a_given_lens(monkeypatch):
-    camera = CameraSpec(id="a", width=64, height=48)
-    monkeypatch.setattr(pipeline, "calibrate_camera", lambda *_, lens, **__: lens)
+def test_the_pipeline_calibrates_with_a_given_lens_and_a_stated_side(monkeypatch):
+    camera = CameraSpec(id="a", width=64, height=48, side="left")
+    monkeypatch.setattr(pipeline, "calibrate_camera", lambda *_, lens, start, **__: [lens, *start])
     match = SimpleNamespace(
         spec=SimpleNamespace(static_cameras=[camera]), clicked={"a": 1}, stills={}, lenses={"a": 2}
     )
-    assert pipeline.calibrate_static_cameras(match, None) == [2]
+    assert pipeline.calibrate_static_cameras(match, None) == [[2, -99.0, 0.0, 0.0]]
 
 
 @pytest.mark.parametrize(("fps", "images"), [(25.0, [900, 919]), (50.0, [1800, 1838])])

@@ -254,7 +254,7 @@ class Comparison:
 
     def people(self, among: Sequence[int], views: int = 2) -> list[Floats]:
         """Return the people (persons, 17, 3) [m] that cameras agree on, frame by frame."""
-        found = []
+        found, settings = [], TrackingSettings(birth_views=views)
         most = max(self.views[c].rays.shape[1] for c in among)
         centers = np.stack([self.views[c].center for c in among])
         focal = self.cameras.focal.mean(axis=-1)
@@ -265,8 +265,8 @@ class Comparison:
                 own = self.views[c].rays[n]
                 rays[k, : len(own)] = own
                 weights[k, : len(own)] = np.isfinite(own[..., 0]) * focal[c] ** 2
-            groups = associate(centers, rays, weights, self._ground, TrackingSettings())
-            joints = [g.joints for g in groups if np.count_nonzero(g.index >= 0) >= views]
+            groups = associate(centers, rays, weights, self._ground, settings)
+            joints = [g.joints for g in groups]
             found.append(np.stack(joints) if joints else np.zeros((0, 17, 3)))
         return found
 

@@ -195,9 +195,10 @@ def _reason(
     """Return one sentence: the fault, the correction, and the share of detections in support."""
     other = "" if fault.other is None else cameras[fault.other]
     if fault.kind == "contradiction":
-        cause = _cause(fault, fault.cause or "pose", fault.detail, other, offset, rate, fps)
+        source = "" if fault.source is None else cameras[fault.source]
+        cause = _cause(fault, fault.cause or "pose", fault.detail, source, offset, rate, fps)
         return (
-            f"it contradicts camera {other}, and two cameras cannot tell which of them is wrong. "
+            f"it contradicts camera {other}, and no majority tells which of them is wrong. "
             f"They agree if this holds for camera {cameras[fault.camera]}: {cause}"
         )
     said = _cause(fault, fault.kind, fault.detail, other, offset, rate, fps)

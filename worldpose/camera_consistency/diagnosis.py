@@ -53,6 +53,7 @@ class Fault:
         value: ratio or frames, if the fault has one.
         other: index of the other camera of a swap, duplicate or contradiction.
         cause: cause of a contradiction, the fault of this camera that would explain it.
+        source: index of the other camera of a swap that would explain a contradiction.
         share_now: share of its detections that agree with others as stated [1].
         share_corrected: the same share after correction of the fault; None without a known
             correction.
@@ -64,6 +65,7 @@ class Fault:
     value: float | None = None
     other: int | None = None
     cause: FaultKind | None = None
+    source: int | None = None
     share_now: float = 0.0
     share_corrected: float | None = None
 
@@ -186,31 +188,25 @@ class Diagnosis:
             suspects = [c for _, c, _ in found if c != worst]
 
     def blame(self, c: int, trial: Trial, core: Sequence[int]) -> None:
-        """Record a fault shown by the cameras of `core`; by one camera alone, a contradiction."""
+        """Record a fault shown by the cameras of `core`.
+
+        Shown by one camera alone, or by no more than those that agree with it, it is a
+        contradiction.
+        """
         others = [p for p in core if p != c]
         people = self.comparison.people(others) if len(others) > 1 else None
         hypothesis = trial.hypothesis
-        found = Fault(
-            c,
-            hypothesis.kind,
-            hypothesis.detail,
-            hypothesis.value,
-            hypothesis.source,
-            share_corrected=None,
-        )
+        kind, source = hypothesis.kind, hypothesis.source
+        found = Fault(c, kind, hypothesis.detail, hypothesis.value, source)
         if people is not None:
             now, corrected = (
                 self.comparison.shares(c, each, people)[0] for each in (STATED, hypothesis)
             )
             found = replace(found, share_now=now, share_corrected=corrected)
-        elif len(others) == 1 and hypothesis.kind != "swapped":
-            found = replace(
-                found,
-                kind="contradiction",
-                other=others[0],
-                cause=hypothesis.kind,
-                share_corrected=None,
-            )
+        own = int((self.agreement[c] > 4.0 * self.deviation[c]).sum()) + 1
+        alone = len(others) == 1 and kind != "swapped"
+        if alone or (c not in core and own >= len(others) > 1):
+            found = replace(found, kind="contradiction", other=others[0], cause=kind, source=source)
         self.faults.append(found)
 
     # -- faults of cameras that agree with no others -----------------------------------------

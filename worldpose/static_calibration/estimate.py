@@ -89,25 +89,20 @@ def calibrate_camera(
         _check_start(start, evidence, where)
     problem = build_problem(evidence, image_size, stated, where=where, lens=lens)
 
-    def begin(problem: CameraProblem) -> Floats:
-        if isinstance(start, Camera):
-            return fit_from_starts(problem, start.numbers[None], stated.wrong_click)[0]
-        return find_start(problem, stated)
+    def explain(start: Camera | Floats | None) -> Explanation:
+        def begin(problem: CameraProblem) -> Floats:
+            if isinstance(start, Camera):
+                return fit_from_starts(problem, start.numbers[None], stated.wrong_click)[0]
+            return find_start(problem, stated)
 
-    found = choose_lens(fit_level_or_rolled(problem, begin, stated), stated)
-    found = find_explanation(found, pitch, stated)
-    check_determined(found, pitch)
+        found = choose_lens(fit_level_or_rolled(problem, begin, stated), stated)
+        found = find_explanation(found, pitch, stated)
+        check_determined(found, pitch)
+        return found
+
+    found = explain(start)
     if not isinstance(start, Camera) and not _tells_side(found):
-        return calibrate_camera(
-            pitch,
-            clicked,
-            image_size,
-            picture=picture,
-            settings=settings,
-            where=where,
-            lens=lens,
-            start=_choose_side(found, pitch, start),
-        )
+        found = explain(_choose_side(found, pitch, start))
     found = try_k3(found)
     lines = None
     if picture is not None and stated.lines:

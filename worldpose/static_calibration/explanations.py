@@ -99,21 +99,18 @@ def find_explanation(
 ) -> Explanation:
     """Return the most probable explanation of consistent clicks.
 
-    Before many clicks count as outliers, or as far noisier than stated, the search tries other
-    explanations: drawn markings are wrong, or the image is a crop, so that the principal point lies
-    elsewhere.
+    The image may be a crop, so that the principal point lies elsewhere: pose and focal length
+    absorb most of it, and the residuals do not tell. Before many clicks count as outliers, or as
+    far noisier than stated, the search is wider, and drawn markings may be wrong.
     """
     max_crop = 0.5  # in widths and heights: a corner of an image of twice its size
     fit, factor = found.fit, found.noise_factor(stated)
     as_stated = scale_noise(found.problem, 1.0 / factor, found.settings)[0]
-    if not is_suspicious(fit, factor):
-        if not fit.inliers.all() or factor * fit.noise_scale > 1.0:
-            check_unit(as_stated, found, pitch, stated)
-        return found
-    check_mirrored(found)
-    problem, best = found.problem, found
+    problem, best, suspicious = found.problem, found, is_suspicious(fit, factor)
     lowest = negative_log_posterior(best, factor=factor, with_prior=True) - CLEAR_GAIN
-    for row in _other_starts(as_stated, stated):
+    if suspicious:
+        check_mirrored(found)
+    for row in _other_starts(as_stated, stated) if suspicious else ():
         try:
             other = fit_inliers_at_best_noise(as_stated, row, stated)
         except InputError:
@@ -122,9 +119,10 @@ def find_explanation(
         own = negative_log_posterior(other, factor=factor, with_prior=True)
         if own < lowest + CLEAR_GAIN:
             lowest, best = own - CLEAR_GAIN, other
-    for assumed, describe in _alternatives(as_stated):
+    for assumed, describe in _alternatives(as_stated, suspicious):
         try:
-            other = fit_inliers_at_best_noise(assumed, find_start(assumed, stated), stated)
+            start = find_start(assumed, stated) if suspicious else fit.row
+            other = fit_inliers_at_best_noise(assumed, start, stated)
         except InputError:
             continue
         shift = np.abs(other.fit.row[2:4] - problem.prior[2:4])
@@ -133,10 +131,13 @@ def find_explanation(
         factor = other.noise_factor(stated)
         own = negative_log_posterior(other, factor=factor, with_prior=True)
         if own < lowest:
-            other = replace(other, assumptions=(describe(other.fit),))
+            other = replace(other, assumptions=(*found.assumptions, describe(other.fit)))
             lowest, best = own, _extend_to_all(as_stated, assumed, other, factor)
-    check_agreement(best, pitch, stated)
-    check_unit(as_stated, best, pitch, stated)
+    if suspicious:
+        check_agreement(best, pitch, stated)
+    noise = best.noise_factor(stated) * best.fit.noise_scale
+    if suspicious or best is not found or not best.fit.inliers.all() or noise > 1.0:
+        check_unit(as_stated, best, pitch, stated)
     return best
 
 
@@ -171,9 +172,9 @@ def _extend_to_all(
 
 
 def _alternatives(
-    problem: CameraProblem,
+    problem: CameraProblem, suspicious: bool
 ) -> Iterator[tuple[CameraProblem, Callable[[InlierFit], str]]]:
-    """Yield alternative problems, each with a function that describes its assumption."""
+    """Yield alternative problems, and functions that describe them; if not suspicious, a crop."""
     evidence, prior = problem.evidence, problem.prior.copy()
     # In widths: covers crops of half the size.
     prior[4] = 0.15 * problem.image_size[0]
@@ -187,7 +188,7 @@ def _alternatives(
         )
 
     names = ", ".join(evidence.markings)
-    if evidence.markings and has_enough_points(evidence):
+    if suspicious and evidence.markings and has_enough_points(evidence):
         points = np.ones(len(evidence.points), dtype=np.bool_)
         alone = problem.select(points, np.zeros(len(evidence.markings), dtype=np.bool_))
         yield alone, lambda fit: f"{names} left out: drawn elsewhere than the points say"

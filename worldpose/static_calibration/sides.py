@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Integers
+from data_contracts.match import Side
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
@@ -90,6 +91,12 @@ def turn_camera(camera: Camera) -> Camera:
     pose = camera.cam_from_world
     half = np.array([-1.0, -1.0, 1.0])
     return replace(camera, cam_from_world=Rigid(pose.rotation * half, pose.translation))
+
+
+def place_at(side: Side) -> Floats:
+    """Return a place (3,) [m], world, far out on a side of the pitch."""
+    axis, meters = {"near": (1, -99), "far": (1, 99), "left": (0, -99), "right": (0, 99)}[side]
+    return np.asarray(meters * np.eye(3)[axis])
 
 
 def turn_name(name: str) -> str:

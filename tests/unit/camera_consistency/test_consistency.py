@@ -208,6 +208,26 @@ def test_exchanged_videos_of_two_cameras_are_named():
     assert {fault.camera: fault.other for fault in result.faults} == {1: 3, 3: 1}
 
 
+def test_two_right_cameras_name_the_fault_of_a_third():
+    cameras = rig()[:3]
+    keypoints = seen(cameras, walkers())
+    cameras[1] = stated(cameras[1], "flipped")
+    assert named(check(cameras, keypoints)) == [(1, "flipped")]
+
+
+def test_two_pairs_of_cameras_contradict_each_other_where_no_majority_decides():
+    cameras = [looking((x, y, 15), (x / 4, 0, 1)) for x in (-45, 45) for y in (-60, 60)]
+    keypoints = seen(cameras, walkers() - [22.0, 0.0, 0.0])
+    keypoints[:, [1, 2]] = keypoints[:, [2, 1]]  # of two cameras opposite to each other
+    result = check(cameras, keypoints)
+    first, second = (fault.camera for fault in result.faults)
+    assert {first, second, *result.confirmed} == {0, 1, 2, 3}
+    said = describe_faults(result, "abcd", [0] * 4, np.ones(4), FPS)
+    for each, other in zip(said, (second, first), strict=True):
+        assert "no majority tells which of them is wrong" in each.reason
+        assert "half a turn" in each.reason or f"that of camera {'abcd'[other]}" in each.reason
+
+
 @pytest.mark.parametrize("cameras", [1, 5])
 def test_without_people_nothing_is_known(cameras):
     result = check(rig()[:cameras], np.full((FRAMES, cameras, 1, 17, 2), np.nan))

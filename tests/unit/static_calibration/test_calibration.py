@@ -69,16 +69,13 @@ def test_a_start_is_one_camera_that_looks_at_the_markings():
             calibrate_camera(PITCH, clicked, SIZE, start=start)
 
 
-def test_a_place_decides_the_side_of_markings_that_both_sides_see_alike():
+def test_markings_that_both_sides_see_alike_are_refused():
     camera = people.pinhole((0.0, -75.0, 18.0), (0.0, 0.0, 0.0), 2100.0, SIZE)
     rng = np.random.default_rng(2)
     drawn = people.draw(camera, ["center_circle", "halfway_line"], rng, count=10, noise=1.0)
     clicked = ClickedMarkings(drawn=drawn)
     with pytest.raises(InputError, match=r"the same from both sides.*center_circle_near"):
         of(clicked)
-    for side in (-1.0, 1.0):
-        found = calibrate_camera(PITCH, clicked, SIZE, start=np.array([5.0, 60.0 * side, 20.0]))
-        np.testing.assert_allclose(found.estimate.camera.center[1], 75.0 * side, rtol=0.2)
 
 
 def test_three_points_are_too_few_and_the_message_names_others():
@@ -330,7 +327,7 @@ def test_an_image_that_is_cropped_off_its_center_is_told_from_wrong_names():
         assert result.report.wrong == ()
         said += any("cropped" in text for text in result.report.decisions)
         assert result.estimate.camera.focal[0] == pytest.approx(camera[0][0, 0], rel=0.1)
-    assert said >= 5
+    assert said == 8
 
 
 def test_a_pitch_in_yards_is_told_from_wrong_clicks():

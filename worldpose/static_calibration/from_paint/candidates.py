@@ -28,6 +28,7 @@ from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.from_paint.paint import ORIENTATIONS, PaintMap
 from worldpose.static_calibration.line_samples import LineSamples
 from worldpose.static_calibration.settings import CameraPrior
+from worldpose.static_calibration.sides import place_at
 
 TILTS: Final = np.radians(np.geomspace(3.0, 45.0, 16))
 """Tilts below the horizon to try [rad]."""
@@ -113,8 +114,7 @@ def thin_out(candidates: Candidates, most: int) -> Candidates:
 
 def stand_on(candidates: Candidates, side: Side) -> Candidates:
     """Return candidates on one side of the pitch: themselves, or turned by half a turn about z."""
-    axis, sign = {"near": (1, -1.0), "far": (1, 1.0), "left": (0, -1.0), "right": (0, 1.0)}[side]
-    turn = np.where(candidates.centers[:, axis] * sign < 0.0, -1.0, 1.0)[:, None]
+    turn = np.where(candidates.centers @ place_at(side) < 0.0, -1.0, 1.0)[:, None]
     half = np.concatenate([turn, turn, np.ones_like(turn)], axis=1)
     return replace(
         candidates,
