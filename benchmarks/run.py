@@ -34,7 +34,7 @@ ROOT = Path(__file__).parents[1]
 DATA = ROOT / "docs" / "results" / "data"
 MODULES = (
     *("speed_cameras", "speed_people", "costs", "second_world"),
-    *("camera_accuracy", "camera_faults", "bodies"),
+    *("camera_accuracy", "camera_faults", "camera_changes", "bodies"),
     *("real", "shelf", "mvor", "line_sets", "real_cameras", "stills", "pose2sim_demo"),
     "result_digests",
 )

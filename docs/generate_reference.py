@@ -38,7 +38,8 @@ RESULT_PAGES = {
     "detection": ("Detection", "detection stills panorama_people finetuning"),
     "static_cameras": (
         "Static cameras",
-        "static_calibration static_accuracy camera_projection camera_faults synchronization "
+        "static_calibration static_accuracy camera_projection camera_faults "
+        "camera_changes synchronization "
         "proposals pitch_lines still_cameras bundle_adjustment",
     ),
     "people": (

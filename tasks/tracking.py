@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from data_contracts.arrays import Floats, Singles
+from data_contracts.arrays import ClipArray, Floats, Singles
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from data_contracts.tracking import TRACKING
 from data_contracts.triangulation import CameraChange
@@ -46,14 +46,9 @@ from worldpose.tracking.plane.tracker import (
 )
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.tracker import Tracking, track_people
-from worldpose.triangulation.camera_changes import (
-    change_record,
-    describe_change,
-    is_by_chance,
-    is_same_change,
-    refine_change,
-)
-from worldpose.triangulation.lost_views import find_lone_views, find_lost_views
+from worldpose.triangulation.camera_changes import describe_change
+from worldpose.triangulation.change_search import follow_changes
+from worldpose.triangulation.lost_views import find_lone_views
 from worldpose.triangulation.world import People, doubt_world
 
 BLOCK: Final = 256
@@ -139,10 +134,12 @@ def _track_people(inputs: UnitInputs) -> Tracked:
     settings = inputs.settings(TrackingSettings)
     pitch_size = None if pitch is None else (pitch.length, pitch.width)
 
-    def track(clip: ClipInputs) -> Tracking:
+    clip = open_clip(inputs)
+
+    def track(detections: KeypointDetections[ClipArray]) -> Tracking:
         return track_people(
             clip.cameras,
-            clip.detections,
+            detections,
             clip.fps,
             settings,
             pitch_size=pitch_size,
@@ -150,7 +147,15 @@ def _track_people(inputs: UnitInputs) -> Tracked:
             camera_covariance=clip.camera_covariance,
         )
 
-    clip, tracks, changes = _follow_changes(inputs, track)
+    followed = follow_changes(
+        clip.camera_ids,
+        clip.cameras,
+        clip.fps,
+        lambda changes: open_clip(inputs, further=changes).detections,
+        track,
+    )
+    clip = replace(clip, detections=followed.detections)
+    tracks, changes = followed.tracks, followed.changes
     found = Identities(
         frame=clip.detections.frame,
         cameras=tuple(clip.camera_ids),
@@ -240,57 +245,6 @@ def _doubts(
     if doubts is not None:
         warnings.append(f"{name}: {doubts}.")
     return figures, warnings
-
-
-def _follow_changes(
-    inputs: UnitInputs, track: Callable[[ClipInputs], Tracking]
-) -> tuple[ClipInputs, Tracking, tuple[CameraChange, ...]]:
-    """Return the clip with far knocks of cameras taken back, its tracks, and cameras' changes.
-
-    One camera is corrected at a time: it spoils the people that the others meet.
-    """
-    clip, changes = open_clip(inputs), list[CameraChange]()
-    frame = np.asarray(clip.detections.frame, dtype=np.int64)
-    while True:
-        tracks = track(clip)
-        if changes:
-            people = clip.detections.assign_people(tracks.detection_index)
-            camera = clip.camera_ids.index(changes[-1].camera)
-            before, after = (
-                changes[-1],
-                refine_change(clip.cameras, people, clip.fps, camera, changes[-1]),
-            )
-            # Just before and after it, people show nothing of a change that is no sudden one.
-            is_gone = math.hypot(*after.shift_px) < 0.25 * math.hypot(*before.shift_px)
-            if is_gone and before.frame is not None:
-                changes[-1] = _slow_change(before)
-                clip = open_clip(inputs, further=changes)
-                continue
-            changes[-1] = after
-            if is_gone or is_by_chance(after):
-                clip = open_clip(inputs, further=changes[:-1])
-                return clip, track(clip), tuple(changes[:-1])
-            clip = open_clip(inputs, further=changes)
-        lost = find_lost_views(clip.cameras, clip.detections, tracks.joints, clip.fps)
-        found = [change_record(each, clip.camera_ids[each.camera], frame) for each in lost]
-        views = [
-            each
-            for each in found
-            if each.kind == "view"
-            and not any(is_same_change(known, each, clip.fps) for known in changes)
-        ]
-        if not views or len(changes) >= 2 * len(clip.camera_ids):
-            return clip, tracks, (*changes, *(each for each in found if each.kind == "clock"))
-        changes.append(views[0])
-        clip = open_clip(inputs, further=changes)
-
-
-def _slow_change(change: CameraChange) -> CameraChange:
-    """Return a sudden change as one that grows over the clip to what is usual after its moment."""
-    assert change.frame is not None
-    begun = (change.frame - change.first_frame) / max(1.0, change.frame_count - 1.0)
-    x, y = (2.0 * each / (1.0 + begun) for each in change.shift_px)
-    return change.model_copy(update={"frame": None, "shift_px": (x, y)})
 
 
 def _pitch(inputs: UnitInputs) -> PitchTemplate | None:

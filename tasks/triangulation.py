@@ -28,15 +28,8 @@ from tasks.unit import UnitInputs, figures_of, unit_task
 from worldpose.camera_consistency.health import CameraHealth, judge_health, measure_health
 from worldpose.ingest.footage import stretches
 from worldpose.store.writer import ResultWriter
-from worldpose.triangulation.camera_changes import (
-    change_record,
-    describe_change,
-    explains_clock,
-    find_changes,
-    is_by_chance,
-    is_same_change,
-    join_changes,
-)
+from worldpose.triangulation.camera_changes import describe_change, find_changes
+from worldpose.triangulation.change_search import add_changes
 from worldpose.triangulation.change_sums import ChangeSums, Kind, choose_bins, sum_joints
 from worldpose.triangulation.estimate import learn_clip, reconstruct_chunks
 from worldpose.triangulation.person_offsets import stated_errors
@@ -225,18 +218,7 @@ def _find_changes(
             "changed. Two cameras cannot tell which."
         )
         return known
-    new = list[CameraChange]()
-    for measured in found:
-        change = change_record(measured, names[measured.camera], frame)
-        if is_by_chance(change):  # told, not taken back
-            change = change.model_copy(update={"is_explained": False})
-        same = [one for one in known if is_same_change(one, change, clip.fps)]
-        if not same:
-            new.append(change)
-        elif change.frame is None:  # the tracker measured the drift on the people that it had left
-            joined = join_changes(clip.cameras[measured.camera], same[0], change)
-            known[known.index(same[0])] = joined
-    known = [each for each in known if not explains_clock(new, each)]
+    known, new = add_changes(known, found, names, clip.cameras, frame, clip.fps)
     if not new and np.median(health.misfit) > 3.0:
         warnings.append(
             "no person agrees with the views: all cameras move within the clip, each in "

@@ -1,4 +1,4 @@
-"""What stages get of a clip: corrections applied, errors and far knocks taken off, times."""
+"""What stages get of a clip: corrections applied, errors taken off, times."""
 
 from contextlib import nullcontext
 from dataclasses import replace
@@ -23,7 +23,6 @@ from worldpose.filtering.systematic_errors import TERMS
 from worldpose.geometry.cameras import Camera, camera_arrays
 from worldpose.geometry.rigid import Rigid
 from worldpose.ingest.clock import ImageClock, camera_frames
-from worldpose.triangulation.camera_changes import MeasuredChange
 
 DIMS = {
     "keypoints": ("detection", "joint", "axis"),
@@ -409,70 +408,3 @@ def test_a_camera_whose_people_meet_nobody_is_named_unless_a_change_explains_it(
     )
     moved, lone = tracking._describe_changes(clip, SimpleNamespace(joints=None), [change])
     assert moved.startswith("camera a") and lone.startswith("camera b: from frame 43 on most")
-
-
-FIRST = 100
-LOST = MeasuredChange(1, "view", 20, np.array([40.0, 0.0, 0.0, 0.0, 0.0]))
-LATE = MeasuredChange(0, "clock", 30, np.array([0.0, 0.0, 0.0, 0.0, 9.0]))
-KNOCK = CameraChange(
-    camera="b",
-    kind="view",
-    frame=FIRST + 20,
-    first_frame=FIRST,
-    frame_count=41,
-    shift_px=(40.0, 0.0),
-    std=None,
-)
-TURNED = KNOCK.model_copy(update={"shift_px": (44.0, 1.0)})
-GONE = KNOCK.model_copy(update={"shift_px": (9.0, 1.0)})
-SUNK = KNOCK.model_copy(update={"frame": None, "shift_px": (80.0 / 1.5, 0.0)})
-SUNK_MORE = SUNK.model_copy(update={"shift_px": (58.0, 2.0)})
-SUNK_LITTLE = SUNK.model_copy(update={"shift_px": (13.0, 0.0)})
-ZOOMED = KNOCK.model_copy(update={"zoom": 0.2})
-
-
-@pytest.mark.parametrize(
-    ("refined", "kept"),
-    [
-        ([TURNED], (TURNED,)),
-        ([GONE, SUNK_MORE], (SUNK_MORE,)),
-        ([GONE, SUNK_LITTLE], ()),
-        ([ZOOMED], ()),
-    ],
-    ids=["knocked", "sunk", "sunk little", "by chance"],
-)
-def test_what_the_people_show_again_of_a_lost_view_decides(monkeypatch, refined, kept):
-    opened, left = list[tuple[CameraChange, ...]](), list(refined)
-    frame = np.arange(FIRST, FIRST + 41)
-
-    def open_clip(_inputs, further=()):
-        opened.append(known := tuple(further))
-        people = SimpleNamespace(frame=frame, further=known, assign_people=lambda _: known)
-        return SimpleNamespace(detections=people, camera_ids=("a", "b", "c"), cameras=None, fps=25)
-
-    def refine_change(_cameras, people, _fps, camera, known):
-        assert camera == 1
-        assert people[-1] == known  # tracked with it taken back
-        return left.pop(0)
-
-    def find_lost_views(_cameras, detections, *_):
-        is_sinking = any(each.frame is None for each in detections.further)
-        return [LATE] if is_sinking else [LOST, LATE]  # a known knock may be found again
-
-    monkeypatch.setattr(tracking, "open_clip", open_clip)
-    monkeypatch.setattr(tracking, "refine_change", refine_change)
-    monkeypatch.setattr(tracking, "find_lost_views", find_lost_views)
-
-    def track(clip):
-        return SimpleNamespace(detection_index=None, joints=clip.detections.further)
-
-    clip, tracks, changes = tracking._follow_changes(None, track)
-    assert not left
-    assert tuple(each for each in changes if each.kind == "view") == kept
-    assert clip.detections.further == kept  # what is written is corrected by what is told
-    if not kept:
-        assert tracks.joints == ()
-    if len(refined) > 1:  # tracked with the slow one taken back before it is refined
-        assert opened[2] == (SUNK,)
-    if kept:  # a clock is told alone
-        assert [each.camera for each in changes if each.kind == "clock"] == ["a"]

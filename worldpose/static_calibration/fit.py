@@ -169,9 +169,17 @@ def fit_cameras(
     )
     clicked = evidence.points_world, evidence.points_image
     drawn = evidence.samples_world, evidence.bounds, evidence.drawn_image, evidence.drawn_marking
-    noise = problem.click_noise, problem.drawn_noise, problem.half_diagonal
-    losses = float(click_loss), float(problem.drawn_loss)
-    given = Measurements(*clicked, *drawn, problem.prior, problem.free, *noise, *losses)
+    given = Measurements(
+        *clicked,
+        *drawn,
+        problem.prior,
+        problem.free,
+        problem.click_noise,
+        problem.drawn_noise,
+        problem.half_diagonal,
+        float(click_loss),
+        float(problem.drawn_loss),
+    )
     _descend(given, iterations, found)
     return found
 
