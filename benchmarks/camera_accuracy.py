@@ -29,10 +29,7 @@ from worldpose.ingest.match_folder import MatchFolder, read_match
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
 from worldpose.static_calibration.estimate import calibrate_camera
-from worldpose.static_calibration.parameters import (
-    CameraEstimate,
-    step_between,
-)
+from worldpose.static_calibration.parameters import CameraEstimate, step_between
 from worldpose.video.files import VideoReader
 
 SHARES = (0.5, 0.8, 0.95, 0.99)

@@ -11,12 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import (
-    load_module,
-    run_in_process,
-    run_worldpose,
-    tell,
-)
+from common import load_module, run_in_process, run_worldpose, tell
 from registry import DATA, Table, Tables, benchmark, integer, option
 
 from data_contracts.run import RunRecord

@@ -6,13 +6,7 @@ import cv2
 import numpy as np
 
 from data_contracts.arrays import Floats, Image, Singles
-from worldpose.training.augmentation import (
-    AugmentationSettings,
-    add_grain,
-    recolour,
-    soften,
-    store,
-)
+from worldpose.training.augmentation import AugmentationSettings, add_grain, recolour, soften, store
 
 
 class RealLooks(AugmentationSettings):

@@ -163,10 +163,7 @@ def render_scene(kind: SceneKind, seed: int, *, views: int, frames: int) -> Iter
 
 
 def label(
-    path: Path,
-    rendered: RenderedFrame,
-    pixels: NDArray[np.float64],
-    visible: NDArray[np.int64],
+    path: Path, rendered: RenderedFrame, pixels: NDArray[np.float64], visible: NDArray[np.int64]
 ) -> LabelledPicture:
     """Return the labels of a rendered frame, of people whose box lies in it.
 

@@ -24,11 +24,7 @@ from scipy.optimize import minimize
 
 from data_contracts.arrays import Flags, Floats
 from worldpose.detection.interfaces import People, ScoreMap
-from worldpose.detection.models import (
-    SHIPPED_SCORE_MAP,
-    load_bundled_detector,
-    load_bundled_pose,
-)
+from worldpose.detection.models import SHIPPED_SCORE_MAP, load_bundled_detector, load_bundled_pose
 from worldpose.training.labels import LabelledPicture, PictureCache, read_labels
 from worldpose.training.metrics import (
     average_precision,

@@ -89,10 +89,7 @@ def convert(model: Path, out: Path, height: int, width: int) -> None:
         if node.name not in used and node.op not in ("Const", "NoOp", "Placeholder")
     ]
     net, _ = tf2onnx.convert.from_graph_def(
-        plain,
-        input_names=[f"{node.name}:0" for node in inputs],
-        output_names=outputs,
-        opset=17,
+        plain, input_names=[f"{node.name}:0" for node in inputs], output_names=outputs, opset=17
     )
     onnx.save(net, str(out))
 

@@ -12,11 +12,7 @@ import numpy as np
 
 from data_contracts.arrays import Flags, Floats
 from data_contracts.camera_consistency import FaultKind
-from worldpose.camera_consistency.comparison import (
-    Comparison,
-    Trial,
-    chance_noise,
-)
+from worldpose.camera_consistency.comparison import Comparison, Trial, chance_noise
 from worldpose.camera_consistency.hypotheses import (
     STATED,
     Hypothesis,
@@ -338,12 +334,7 @@ class Diagnosis:
     def rank(trial: Trial) -> float:
         """Return the rank of an explanation: matches, reduced for kinds with more freedom."""
         # Kinds with more freedom count less.
-        simpler = {
-            "pose": 1.05,
-            "focal": 1.02,
-            "lens": 1.02,
-            "frame_rate": 1.05,
-        }
+        simpler = {"pose": 1.05, "focal": 1.02, "lens": 1.02, "frame_rate": 1.05}
         return trial.matches / simpler.get(trial.hypothesis.kind, 1.0)
 
     def polish(self, c: int, hypothesis: Hypothesis, partners: Sequence[int]) -> Hypothesis:

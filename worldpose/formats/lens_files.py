@@ -418,12 +418,7 @@ def _image_size(given: Mapping[str, Any]) -> tuple[int, int] | None:
 
 
 def _lens(
-    where: str,
-    name: str,
-    table: Mapping[str, Any],
-    size: tuple[int, int],
-    *,
-    has_size: bool = True,
+    where: str, name: str, table: Mapping[str, Any], size: tuple[int, int], *, has_size: bool = True
 ) -> LensCalibration:
     """Return the lens of a table at the size of the camera's images."""
     # The same of the image corner's displacement, relative to its distance from the centre

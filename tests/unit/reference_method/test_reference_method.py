@@ -17,10 +17,7 @@ from worldpose.geometry.cameras import Camera  # noqa: E402
 from worldpose.pitch.template import PitchTemplate  # noqa: E402
 from worldpose.reference_method import body_fitting, broadcast_calibration  # noqa: E402
 from worldpose.reference_method.cameras import TensorCameras  # noqa: E402
-from worldpose.reference_method.reprojection import (  # noqa: E402
-    triangulate,
-    triangulate_about_mid_hip,
-)
+from worldpose.reference_method.reprojection import triangulate, triangulate_about_mid_hip  # noqa: E402
 from worldpose.reference_method.static_calibration import (  # noqa: E402
     camera_from_plane,
     distance_map,
