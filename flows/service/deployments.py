@@ -12,12 +12,12 @@ from prefect import Flow
 from prefect.utilities.callables import parameter_schema
 
 from flows.orchestration.prefect_api import PrefectApi
+from flows.service.health import of_other_project
 from flows.service.layout import PRIORITIES
 from flows.service.match_runs import MatchRuns
 from flows.service.plan import Schedule, ServePlan, deployment_name
 from flows.service.recovery import adopt_due
 from flows.service.worker import JOB_TEMPLATE, Installed, ServedWorker
-from worldpose.errors import InputError
 
 MODULE: Final = "flows.service.deployed"
 """Module of the deployed flows; it starts Prefect's task runner when it is imported."""
@@ -90,7 +90,8 @@ def install(plan: ServePlan) -> dict[str, Installed]:
         InputError: another project has deployments of this name at the server.
     """
     prefect = MatchRuns.of_plan(plan)
-    _refuse_other_project(prefect, plan)
+    if (refusal := of_other_project(prefect, plan, plan.state_folder)) is not None:
+        raise refusal
     matches, arrivals = pools(plan)
     for pool, limit, about in (
         (matches, plan.max_concurrent, "Matches, urgent ones first"),
@@ -191,23 +192,6 @@ def _update(
     wanted = {**wanted, "parameters": {**known, **wanted["parameters"]}}
     if any(there[name] != value for name, value in wanted.items()):
         prefect.ask(place, wanted, method="PATCH")
-
-
-def _refuse_other_project(prefect: PrefectApi, plan: ServePlan) -> None:
-    there = prefect.deployment(plan.match_deployment)
-    if there is None or there["parameters"].get("project") == plan.project:
-        return
-    raise InputError(
-        f"deployment {plan.match_deployment} at {plan.prefect}",
-        expected=f"that of project {plan.project}",
-        found=f"that of {there['parameters'].get('project')}",
-        todo=(
-            f"Was the project moved? Move it back, or remove {plan.state}: nothing is lost "
-            "but Prefect's history, and what lies in the inbox is taken in once more."
-            if plan.owns_prefect
-            else "Give this project's deployments another name with --name."
-        ),
-    )
 
 
 def _install(prefect: PrefectApi, kind: str, name: str, values: dict[str, Any], **new: str) -> None:

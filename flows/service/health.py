@@ -15,7 +15,8 @@ from flows.orchestration.prefect_api import PrefectApi, UnreachablePrefectError,
 from flows.orchestration.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN, problem_at
 from flows.service.alerts import STANDSTILLS, kept_alerts
 from flows.service.layout import StateFolder, disk_answers, is_alive
-from flows.service.plan import FLOWS, deployment_name
+from flows.service.plan import FLOWS, ServePlan, deployment_name
+from worldpose.errors import InputError
 
 WORKER_SECONDS: Final = 90.0
 """Without a heartbeat for so long, a worker counts as lost; it sends one every 30 s."""
@@ -45,7 +46,7 @@ def check(state: StateFolder) -> list[Finding]:
     found = [Finding("serve", True, f"process {pid}, since {serving.started_at:%Y-%m-%d %H:%M}Z")]
     found += _check_processes(state, serving)
     found += _check_servers(state, serving)
-    found += at_prefect(serving, state.client_login(serving))
+    found += at_prefect(state, serving)
     found += _check_progress(state)
     found.append(_check_inbox(state, serving))
     free = shutil.disk_usage(state.folder).free / 1e9
@@ -80,14 +81,39 @@ def _check_servers(state: StateFolder, serving: Serving) -> Iterator[Finding]:
             yield Finding(name, False, problem, f"See {log}; end worldpose serve and begin again.")
 
 
-def at_prefect(serving: Serving, login: str | None) -> Iterator[Finding]:
-    """Check that deployments exist, and that a worker takes their runs."""
-    prefect = PrefectApi(serving.prefect, login, tries=1)
+def of_other_project(
+    prefect: PrefectApi, serving: Serving | ServePlan, state: StateFolder
+) -> InputError | None:
+    """Return the refusal of a server where another project has deployments of this name."""
+    name = deployment_name(serving.name, "match")
+    there = prefect.deployment(name)
+    if there is None or there["parameters"].get("project") == serving.project:
+        return None
+    return InputError(
+        f"deployment {name} at {serving.prefect}",
+        expected=f"that of project {serving.project}",
+        found=f"that of {there['parameters'].get('project')}",
+        todo=(
+            f"Was the project moved? Move it back, or remove {state.folder}: nothing is lost "
+            "but Prefect's history, and what lies in the inbox is taken in once more."
+            if serving.owns_prefect
+            else "Give this project's deployments another name with --name."
+        ),
+    )
+
+
+def at_prefect(state: StateFolder, serving: Serving) -> Iterator[Finding]:
+    """Check that its own deployments exist, and that a worker takes their runs."""
+    prefect = PrefectApi(serving.prefect, state.client_login(serving), tries=1)
     try:
         names = {flow: deployment_name(serving.name, flow) for flow in FLOWS}
         missing = [flow for flow, name in names.items() if prefect.deployment(name) is None]
         words = f"missing: {', '.join(missing)}" if missing else ", ".join(FLOWS)
-        yield Finding("deployments", not missing, words, AGAIN)
+        if (refusal := of_other_project(prefect, serving, state)) is not None:
+            words = f"expected {refusal.expected}, found {refusal.found}"
+            yield Finding("deployments", False, words, refusal.todo)
+        else:
+            yield Finding("deployments", not missing, words, AGAIN)
         for pool in (serving.name, f"{serving.name}-arrivals"):
             yield check_worker(prefect, pool)
     except UnreachablePrefectError as error:

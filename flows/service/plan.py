@@ -128,11 +128,6 @@ class ServePlan(Record):
         name = self.host if is_here or not self.names else self.names[0]
         return f"{scheme}://{name}:{self.pages_port}"
 
-    @property
-    def match_deployment(self) -> str:
-        """Name of the Prefect deployment that processes matches."""
-        return deployment_name(self.name, "match")
-
 
 SCHEDULED: Final = ("ingest", "reprocess")
 """Flows that run without parameters of a person."""

@@ -19,6 +19,7 @@ from typing import Final
 from urllib.parse import urlsplit
 
 from data_contracts.operations import Service, Serving
+from flows.orchestration.prefect_api import PrefectApi
 from flows.orchestration.prefect_environment import (
     begin_database,
     keep_database,
@@ -27,7 +28,7 @@ from flows.orchestration.prefect_environment import (
     require_login,
     served_environment,
 )
-from flows.service.health import at_prefect
+from flows.service.health import at_prefect, of_other_project
 from flows.service.layout import PRIORITIES
 from flows.service.plan import Secrets, ServePlan
 from flows.web.http_server import require_free_ports
@@ -228,7 +229,7 @@ def bound_log(log: Path) -> None:
 
 
 def _bring_up(supervisor: _Supervisor, told: threading.Event) -> None:
-    plan = supervisor.plan
+    plan, state = supervisor.plan, supervisor.plan.state_folder
     local = "127.0.0.1" if plan.host in ("0.0.0.0", "::") else plan.host
 
     def wait_for(part: _Part, health: str) -> None:
@@ -248,15 +249,18 @@ def _bring_up(supervisor: _Supervisor, told: threading.Event) -> None:
         )
     else:
         require_login(plan.prefect)
+    prefect = PrefectApi(plan.prefect, supervisor.secrets.prefect)
+    if not told.is_set() and (refusal := of_other_project(prefect, plan, state)):
+        raise refusal
     pages = supervisor.start("pages", plan.pages)
     worker = supervisor.start("worker")
     watch = supervisor.start("watch", f"http://{plan.host}:{plan.metrics_port}/metrics")
-    serving, login = supervisor.write(), supervisor.secrets.prefect
+    serving = supervisor.write()
     if plan.certificate is None:
         wait_for(pages, f"http://{local}:{plan.pages_port}/api/health")
     wait_for(watch, f"http://{local}:{plan.metrics_port}/health")
 
-    worker.wait_until(lambda: all(it.is_well for it in at_prefect(serving, login)), told)
+    worker.wait_until(lambda: all(it.is_well for it in at_prefect(state, serving)), told)
 
 
 def environment_of(plan: ServePlan) -> dict[str, str]:

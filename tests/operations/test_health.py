@@ -14,11 +14,14 @@ from data_contracts.operations import Arrival, Service, Serving
 from flows.cli import options
 from flows.cli.project import status
 from flows.cli.serve import serve
+from flows.orchestration.prefect_api import PrefectApi
 from flows.orchestration.prefect_environment import CLIENT_LOGIN
 from flows.service import health, layout
-from flows.service.health import _check_inbox, check
+from flows.service import serving as supervising
+from flows.service.health import _check_inbox, at_prefect, check
 from flows.service.layout import StateFolder
 from flows.service.match_runs import match_runs_of
+from flows.service.plan import Secrets, ServePlan
 from flows.web.http_server import require_free_ports
 from worldpose.errors import InputError
 
@@ -85,6 +88,24 @@ def test_every_part_that_is_not_well_says_how_to_mend_it(server, state, tmp_path
         assert found["deployments"].remedy == "Fix prefect first."
         inbox = found["inbox"]
         assert (inbox.is_well, inbox.state) == (True, "3 known, 2 refused")
+
+
+def test_a_moved_project_is_refused_before_its_worker_starts(state, tmp_path, monkeypatch):
+    there = {"parameters": {"project": "/before/the/move"}}
+    monkeypatch.setattr(PrefectApi, "deployment", lambda self, name: there)
+    monkeypatch.setattr(PrefectApi, "find", lambda self, path: None)
+    monkeypatch.setattr(supervising, "problem_at", lambda address: "")
+    monkeypatch.setattr(supervising, "require_login", lambda address: None)
+    ports = dict(zip(("pages_port", "metrics_port"), free_ports(2), strict=True))
+    folders = {"project": str(tmp_path), "inbox": tmp_path / "inbox", "state": state.folder}
+    plan = ServePlan(**folders, **ports, prefect="http://127.0.0.1:9/api", owns_prefect=False)
+    with pytest.raises(InputError, match=r"found that of /before/the/move\. .*--name"):
+        supervising.serve(plan, Secrets("", "", None), lambda: None, print)
+    assert not state.logs.exists()
+    own = serving(tmp_path, plan.prefect).model_copy(update={"owns_prefect": True})
+    found = by_part(at_prefect(state, own))["deployments"]
+    assert (found.is_well, "/before/the/move" in found.state) == (False, True)
+    assert f"Move it back, or remove {state.folder}" in found.remedy
 
 
 HOST = "127.0.0.1"
