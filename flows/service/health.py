@@ -71,7 +71,7 @@ def _check_servers(state: StateFolder, serving: Serving) -> Iterator[Finding]:
             origin = "/".join(service.address.split("/")[:3])
             addresses[name] = origin.replace("0.0.0.0", "127.0.0.1") + path
     for name, address in addresses.items():
-        problem = problem_at(address)
+        problem = problem_at(address, serving.certificate if name == "pages" else None)
         if not problem:
             yield Finding(name, True, f"answers at {address}")
         elif name == "prefect" and not serving.owns_prefect:

@@ -124,6 +124,7 @@ class _Supervisor:
             name=plan.name,
             prefect=plan.prefect,
             owns_prefect=plan.owns_prefect,
+            certificate=None if plan.certificate is None else str(plan.certificate.resolve()),
             services={**services, "serve": Service(pid=os.getpid())},
             started_at=datetime.now(UTC),
         )

@@ -2,8 +2,12 @@
 
 import os
 import socket
+import ssl
 from contextlib import ExitStack
 from datetime import UTC, datetime
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from threading import Thread
 from types import SimpleNamespace
 
 import pytest
@@ -16,9 +20,10 @@ from flows.cli.project import status
 from flows.cli.serve import serve
 from flows.orchestration.prefect_api import PrefectApi
 from flows.orchestration.prefect_environment import CLIENT_LOGIN
+from flows.orchestration.private_cluster import write_certificate
 from flows.service import health, layout
 from flows.service import serving as supervising
-from flows.service.health import _check_inbox, at_prefect, check
+from flows.service.health import _check_inbox, _check_servers, at_prefect, check
 from flows.service.layout import StateFolder
 from flows.service.match_runs import match_runs_of
 from flows.service.plan import Secrets, ServePlan
@@ -106,6 +111,27 @@ def test_a_moved_project_is_refused_before_its_worker_starts(state, tmp_path, mo
     found = by_part(at_prefect(state, own))["deployments"]
     assert (found.is_well, "/before/the/move" in found.state) == (False, True)
     assert f"Move it back, or remove {state.folder}" in found.remedy
+
+
+def test_pages_with_a_certificate_of_another_name_are_well(state, tmp_path):
+    for name in ("own", "other"):
+        write_certificate(tmp_path / name)
+    handler = partial(SimpleHTTPRequestHandler, directory=tmp_path)
+    (tmp_path / "api").mkdir()
+    (tmp_path / "api" / "health").touch()
+    with ThreadingHTTPServer((HOST, 0), handler) as pages:
+        tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        tls.load_cert_chain(tmp_path / "own" / "certificate.pem", tmp_path / "own" / "key.pem")
+        pages.socket = tls.wrap_socket(pages.socket, server_side=True)
+        Thread(target=pages.serve_forever, daemon=True).start()
+        address = f"https://{HOST}:{pages.server_address[1]}/review"
+        here = Service(pid=os.getpid(), address=address)
+        for name, is_well in (("own", True), ("other", False), ("none", False)):
+            certificate = {"certificate": str(tmp_path / name / "certificate.pem")}
+            served = serving(tmp_path, "http://127.0.0.1:9/api", pages=here)
+            found = by_part(_check_servers(state, served.model_copy(update=certificate)))
+            assert found["pages"].is_well == is_well, found["pages"]
+        pages.shutdown()
 
 
 HOST = "127.0.0.1"
