@@ -46,6 +46,23 @@ def test_runs_and_pages_import_nothing_that_only_draws_or_opens_results(modules,
     subprocess.run([sys.executable, "-c", script], check=True)
 
 
+def test_a_wrong_setting_is_a_wrong_use_and_told_its_form_or_a_near_name(store):
+    for stated, *told in (
+        ("exports=joints", "found 'joints'", "exports=[joints]"),
+        ("pitch=fifa", "found 'fifa'", "pitch={template: football}"),
+        ("sides=left", "found 'left'", "sides={cam1: left}"),
+        ("nonsense=2", "the name of a setting", "--list"),
+        ("detection.strid=2", "'detection.stride'", "--list"),
+        ("exports=[", "found '['", "exports=[joints]"),
+    ):
+        wrong = said(store, "settings", "--set", stated).exception
+        assert isinstance(wrong, UsageError)
+        assert all(each in str(wrong) for each in (f"--set {stated}", *told)), wrong
+    for stated in ("exports=[joints]", "pitch={template: football}", "sides={cam1: left}"):
+        assert said(store, "settings", "--set", stated).exit_code == 0
+    assert '"left"' in said(store, "settings", "--json").stdout
+
+
 @pytest.mark.parametrize("option", ["--help", "--version"])
 def test_the_program_answers_without_an_orchestrator_or_a_numeric_library(option):
     script = (
@@ -187,7 +204,7 @@ def test_the_exit_code_of_a_run_says_how_it_ended(state, code, told, store, tmp_
     monkeypatch.setattr(run_command, "run_match", lambda *_: ended(state))
     answer = said(store, "run", "a")
     assert (answer.exit_code, told in answer.stdout) == (code, True)
-    assert "1.0 s; the whole command, with the start of Prefect: 0." in answer.stdout
+    assert "1.0 s; this command: 0." in answer.stdout  # less than its run took: an earlier one
     as_json = said(store, "run", "a", "--json")
     assert as_json.exit_code == code
     assert json.loads(as_json.stdout)["failed"] == (state in ("failed", "partial"))
@@ -210,7 +227,10 @@ def test_a_run_that_has_not_ended_is_told_and_listed(store, tmp_path):
     told = r"run 1 of match a .*one of 0002, found an unfinished run. List them: worldpose status a"
     with pytest.raises(InputError, match=told):
         raise said(store, "diff", "a/1", "a/2").exception
-    assert "a: runs that ended: 0002; that have not: 0001\n" in said(store, "status", "a").stdout
+    assert said(store, "settings", "a", "--set", "detection.batch=2").exit_code == 0
+    told = said(store, "status", "a").stdout
+    assert "a: runs that ended: 0002; that have not: 0001\n" in told
+    assert "settings of its next run: detection.batch=2\n" in told
     assert "forget it: worldpose gc --delete --forget a/0001\n" in said(store, "gc").stdout
     removed = said(store, "gc", "--delete", "--forget", f"a/{killed}").stdout
     assert "removed: 1 x reservation of a dead run (" in removed
