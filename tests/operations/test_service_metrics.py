@@ -173,9 +173,10 @@ def test_strangers_see_nothing_and_others_the_matches_by_stage(app, project_copy
     browser = TestClient(app, base_url="http://127.0.0.1:8571")
     for path in ("/status", "/api/status", "/status/page.css", "/status/page.js"):
         assert browser.get(path).status_code == 401
-    StateFolder(project_copy / "operations").write_arrival(
-        arrival(name=EVIL, state="refused", reason=EVIL)
-    )
+    state = StateFolder(project_copy / "operations")
+    state.write_arrival(arrival(name=EVIL, state="refused", reason=EVIL))
+    told = dict.fromkeys(("alert", "match", "text", "link", "since"), "x") | {"told_by": []}
+    state.alerts.write_text(json.dumps({"disk": told, "digest": {**told, "alert": "digest"}}))
     assert browser.post("/api/login", json={"who": "Ada", "token": TOKEN}).status_code == 200
     page = browser.get("/status")
     assert "default-src 'none'" in page.headers["content-security-policy"]
@@ -198,6 +199,7 @@ def test_strangers_see_nothing_and_others_the_matches_by_stage(app, project_copy
     assert {each["state"] for each in cameras} == {"done"}
     assert all(each["seconds"] > 0 for each in cameras)
     assert [each["state"] for each in answer["arrivals"]] == ["refused"]
+    assert answer["alerts"] == [told]
 
 
 def test_a_match_that_cannot_be_read_hides_no_other(project_copy):
