@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import cache
@@ -29,7 +28,6 @@ from flows.method import METHOD
 from flows.stage import Stage
 from worldpose.detection.models import LIBRARIES
 from worldpose.errors import InputError, UsageError, unknown_name
-from worldpose.formats.files import parse_yaml
 from worldpose.store.store import Store
 
 Overrides = Mapping[str, Mapping[str, JsonValue]]
@@ -231,7 +229,7 @@ def parse_overrides(assignments: list[str], stages: tuple[Stage, ...] = METHOD) 
 
 
 def parse_value(text: str, name: str = "") -> JsonValue:
-    """Return the value of a setting, given as JSON, as a list or mapping of YAML, or else as text.
+    """Return the value of a setting, given as JSON or else as text.
 
     Venues can be numbers; files of weights of `detection` get absolute paths.
     """
@@ -239,9 +237,6 @@ def parse_value(text: str, name: str = "") -> JsonValue:
         value: JsonValue = json.loads(text)
     except (ValueError, RecursionError):  # not JSON, or unclosed brackets
         value = text
-        if text.startswith(("[", "{")):
-            with suppress(InputError):  # neither JSON nor YAML
-                value = parse_yaml(f"--set {name}", text)
     if name.startswith("detection."):
         return _absolute_weights(value)
     return text if name == "venue" and isinstance(value, int | float) else value
