@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -20,6 +20,8 @@ from worldpose.errors import InputError
 
 WORKER_SECONDS: Final = 90.0
 """Without a heartbeat for so long, a worker counts as lost; it sends one every 30 s."""
+BEGIN_SECONDS: Final = 300.0
+"""Start timeout: the first start creates a database, and machines are busy [s]."""
 LOW_DISK_GB: Final = 1.0
 """With less free space, computation will soon fail [GB]."""
 AGAIN: Final = "End worldpose serve and begin it again: it installs what is missing."
@@ -37,8 +39,10 @@ class Finding:
 
 def check(state: StateFolder) -> list[Finding]:
     """Check everything that `worldpose serve` runs, dependencies first."""
-    serving = state.read_serving()
-    if serving is None or not state.is_held("serve"):
+    serving, is_held = state.read_serving(), state.is_held("serve")
+    if serving is None and is_held:
+        return [Finding("serve", False, "it starts", "Wait until it has printed its addresses.")]
+    if serving is None or not is_held:
         was = "it was killed" if serving is not None else "it was not started, or ended"
         begin = "Begin it: worldpose serve, with the project and options that it should have."
         return [Finding("serve", False, f"nothing serves this project: {was}", begin)]
@@ -47,6 +51,10 @@ def check(state: StateFolder) -> list[Finding]:
     found += _check_processes(state, serving)
     found += _check_servers(state, serving)
     found += at_prefect(state, serving)
+    seconds = (datetime.now(UTC) - serving.started_at).total_seconds()
+    if seconds < BEGIN_SECONDS:
+        wait = f"It began {seconds:.0f} s ago, and may still start: wait, and check again. If not: "
+        found = [it if it.is_well else replace(it, remedy=wait + it.remedy) for it in found]
     found += _check_progress(state)
     found.append(_check_inbox(state, serving))
     free = shutil.disk_usage(state.folder).free / 1e9
@@ -118,11 +126,10 @@ def at_prefect(state: StateFolder, serving: Serving) -> Iterator[Finding]:
             yield check_worker(prefect, pool)
     except UnreachablePrefectError as error:
         variable = SERVER_LOGIN if serving.owns_prefect else CLIENT_LOGIN
-        remedy = "Fix prefect first."
+        remedy = "Fix prefect first; if it is well, it is busy: check again."
         if error.status == 401:
             remedy = f"Set {variable} as it was when the service began."
-        yield Finding("deployments", False, f"Prefect {error.problem}", remedy)
-        return
+        yield Finding("deployments", False, f"unknown: Prefect's API {error.problem}", remedy)
 
 
 def check_worker(prefect: PrefectApi, pool: str) -> Finding:

@@ -28,19 +28,18 @@ from flows.orchestration.prefect_environment import (
     require_login,
     served_environment,
 )
-from flows.service.health import at_prefect, of_other_project
+from flows.service.health import BEGIN_SECONDS, at_prefect, of_other_project
 from flows.service.layout import PRIORITIES
 from flows.service.plan import Secrets, ServePlan
 from flows.web.http_server import require_free_ports
 from worldpose.errors import UsageError, WorldposeError
+from worldpose.store.blobs import storage_errors
 from worldpose.store.store import Store
 
 LONGEST_PAUSE: Final = 60.0
 """Between two starts of a process that keeps ending [s]."""
 STEADY_SECONDS: Final = 120.0
 """A process that ran for so long is restarted at once."""
-BEGIN_SECONDS: Final = 300.0
-"""Start timeout: the first start creates a database, and machines are busy [s]."""
 END_SECONDS: Final = 15.0
 """Time to end before a process is killed."""
 LOG_BYTES: Final = 10_000_000
@@ -181,10 +180,11 @@ def serve(plan: ServePlan, secrets: Secrets, ready: Callable[[], None], tell: Te
         WorldposeError: a part does not answer in time.
     """
     Store.create(plan.project)
-    for priority in PRIORITIES:
-        (plan.inbox / ("" if priority == "normal" else priority)).mkdir(parents=True, exist_ok=True)
     state = plan.state_folder
-    state.folder.mkdir(parents=True, exist_ok=True)
+    queues = ["" if priority == "normal" else priority for priority in PRIORITIES]
+    for folder in (*(plan.inbox / each for each in queues), state.folder):
+        with storage_errors(str(folder)):
+            folder.mkdir(parents=True, exist_ok=True)
     with state.only_one("serve", wait=False) as is_alone:
         if not is_alone:
             raise UsageError(

@@ -6,7 +6,7 @@ import ssl
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from threading import Thread
 from types import SimpleNamespace
 
@@ -28,7 +28,7 @@ from flows.service.layout import StateFolder
 from flows.service.match_runs import match_runs_of
 from flows.service.plan import Secrets, ServePlan
 from flows.web.http_server import require_free_ports
-from worldpose.errors import InputError
+from worldpose.errors import InputError, StoreError
 
 
 @pytest.fixture
@@ -56,6 +56,10 @@ def test_what_was_never_started_or_killed_is_said(state, tmp_path):
     (finding,) = check(state)
     assert (finding.part, finding.is_well) == ("serve", False)
     assert "not started" in finding.state
+    state.folder.mkdir()
+    with state.only_one("serve", wait=False):
+        assert [each.state for each in check(state)] == ["it starts"]
+    (state.folder / "serve.lock").unlink()
     state.write_serving(serving(tmp_path, "http://127.0.0.1:9/api"))
     (finding,) = check(state)
     assert "killed" in finding.state
@@ -90,7 +94,8 @@ def test_every_part_that_is_not_well_says_how_to_mend_it(server, state, tmp_path
             state.write_arrival(Arrival(name=name, state=seen, changed_at=datetime.now(UTC)))
         found = by_part(check(state))
         assert "Start the Prefect server" in found["prefect"].remedy
-        assert found["deployments"].remedy == "Fix prefect first."
+        assert "began 0 s ago" in found["deployments"].remedy  # it may start yet
+        assert "Fix prefect first; if it is well" in found["deployments"].remedy
         inbox = found["inbox"]
         assert (inbox.is_well, inbox.state) == (True, "3 known, 2 refused")
 
@@ -98,40 +103,36 @@ def test_every_part_that_is_not_well_says_how_to_mend_it(server, state, tmp_path
 def test_a_moved_project_is_refused_before_its_worker_starts(state, tmp_path, monkeypatch):
     there = {"parameters": {"project": "/before/the/move"}}
     monkeypatch.setattr(PrefectApi, "deployment", lambda self, name: there)
-    monkeypatch.setattr(PrefectApi, "find", lambda self, path: None)
-    monkeypatch.setattr(supervising, "problem_at", lambda address: "")
-    monkeypatch.setattr(supervising, "require_login", lambda address: None)
-    ports = dict(zip(("pages_port", "metrics_port"), free_ports(2), strict=True))
-    folders = {"project": str(tmp_path), "inbox": tmp_path / "inbox", "state": state.folder}
-    plan = ServePlan(**folders, **ports, prefect="http://127.0.0.1:9/api", owns_prefect=False)
+    for name in ("problem_at", "require_login", "_require_free_ports"):
+        monkeypatch.setattr(supervising, name, lambda _: "")
+    own, inbox = serving(tmp_path, "http://127.0.0.1:9/api"), tmp_path / "inbox"
+    about = {"project": own.project, "name": own.name, "prefect": own.prefect}
+    plan = ServePlan(**about, inbox=inbox, state=state.folder, owns_prefect=False)
+    begin = partial(supervising.serve, plan, Secrets("", "", None), lambda: None, print)
+    inbox.touch()  # its folders cannot be made, as for want of permission
+    with pytest.raises(StoreError, match=r"run again\. Published results are unchanged"):
+        begin()
+    inbox.unlink()
     with pytest.raises(InputError, match=r"found that of /before/the/move\. .*--name"):
-        supervising.serve(plan, Secrets("", "", None), lambda: None, print)
+        begin()
     assert not state.logs.exists()
-    own = serving(tmp_path, plan.prefect).model_copy(update={"owns_prefect": True})
-    found = by_part(at_prefect(state, own))["deployments"]
+    found = next(at_prefect(state, own.model_copy(update={"owns_prefect": True})))
     assert (found.is_well, "/before/the/move" in found.state) == (False, True)
     assert f"Move it back, or remove {state.folder}" in found.remedy
 
 
-def test_pages_with_a_certificate_of_another_name_are_well(state, tmp_path):
-    for name in ("own", "other"):
-        write_certificate(tmp_path / name)
-    handler = partial(SimpleHTTPRequestHandler, directory=tmp_path)
-    (tmp_path / "api").mkdir()
-    (tmp_path / "api" / "health").touch()
-    with ThreadingHTTPServer((HOST, 0), handler) as pages:
+def test_pages_are_asked_with_their_own_certificate(state, tmp_path):
+    write_certificate(tmp_path)
+    own, key = tmp_path / "certificate.pem", tmp_path / "key.pem"
+    with HTTPServer((HOST, 0), BaseHTTPRequestHandler) as pages:
         tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-        tls.load_cert_chain(tmp_path / "own" / "certificate.pem", tmp_path / "own" / "key.pem")
+        tls.load_cert_chain(own, key)
         pages.socket = tls.wrap_socket(pages.socket, server_side=True)
-        Thread(target=pages.serve_forever, daemon=True).start()
-        address = f"https://{HOST}:{pages.server_address[1]}/review"
-        here = Service(pid=os.getpid(), address=address)
-        for name, is_well in (("own", True), ("other", False), ("none", False)):
-            certificate = {"certificate": str(tmp_path / name / "certificate.pem")}
-            served = serving(tmp_path, "http://127.0.0.1:9/api", pages=here)
-            found = by_part(_check_servers(state, served.model_copy(update=certificate)))
-            assert found["pages"].is_well == is_well, found["pages"]
-        pages.shutdown()
+        Thread(target=pages.handle_request, daemon=True).start()
+        at = Service(pid=os.getpid(), address=f"https://{HOST}:{pages.server_port}/login")
+        served = serving(tmp_path, "http://127.0.0.1:9/api", pages=at)
+        served = served.model_copy(update={"certificate": str(own)})
+        assert by_part(_check_servers(state, served))["pages"].state.endswith("answers 501")
 
 
 HOST = "127.0.0.1"
