@@ -36,7 +36,7 @@ class Arrival(Record):
 
     contract: Literal[1] = CONTRACT_VERSION
     name: str
-    """Path below the inbox; characters that are not plain ASCII are escaped."""
+    """Path below the inbox; characters that cannot be printed are escaped."""
     state: ArrivalState
     reason: str = ""
     """Reason of the state."""
@@ -82,6 +82,8 @@ class Serving(Record):
     """Address of Prefect's API."""
     owns_prefect: bool
     """Whether the Prefect server ends with `worldpose serve`."""
+    certificate: str | None = None
+    """PEM file of the certificate of the pages."""
     services: dict[str, Service]
     """Name to process."""
     started_at: datetime

@@ -50,12 +50,12 @@ class RunSettings(UsableLimits):
     body_folder: Folder | None = None
     """Folder of installed bodies; by default that of WORLDPOSE_BODY_FOLDER, or else the user's."""
     exports: tuple[Annotated[str, AfterValidator(_known)], ...] = ()
-    """Formats that are exported after each run that has results."""
+    """Formats that are exported after each run that has results, as in exports=["joints"]."""
     exports_folder: Folder | None = None
     """Folder of these exports, one folder in it per match; by default `exports` of the project."""
     pitch: PitchSpec | None = None
-    """The pitch of matches without a pitch of their own, as pitch.json has it."""
+    """The pitch of matches without a pitch of their own, as in pitch={"template": "football"}."""
     lenses: tuple[LensCalibration, ...] = ()
     """Lenses of static cameras, by their id, that neither lenses.toml nor calibration.toml has."""
     sides: dict[Name, Side] = {}
-    """Camera to its side of the pitch, where match.yaml states none."""
+    """Camera to its side, where match.yaml states none, as in sides={"cam1": "left"}."""

@@ -155,7 +155,11 @@ class StoreError(WorldposeError):
 
 
 class CorruptionError(StoreError):
-    """Stored bytes are not the bytes that were published."""
+    """Stored bytes are not the bytes that were published; `verify` says `todo` by itself."""
+
+    def __init__(self, problem: str, todo: str = "") -> None:
+        self.problem = problem
+        super().__init__(f"{problem} {todo}".rstrip())
 
 
 class NondeterminismError(StoreError):

@@ -16,6 +16,7 @@ from flows.overview import PAGE, read_summary
 from flows.registering import find_registration
 from flows.results.timings import in_bytes
 from flows.run_status import UnitState, find_run
+from flows.settings import as_text, flatten
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.store.garbage import collect, plan_gc
 from worldpose.store.integrity import repair
@@ -106,8 +107,9 @@ def _print_status(rows: Sequence[Mapping[str, Any]]) -> None:
         for name, run_id in row["pins"].items():
             console.line(f"{row['match']}: run {run_id} is pinned as {name}")
         if row["settings"]:
+            stated = (f"{name}={as_text(it)}" for name, it in flatten(row["settings"]).items())
             console.line(
-                f"{row['match']}: judged with the settings of its next run: {row['settings']}"
+                f"{row['match']}: judged with the settings of its next run: {', '.join(stated)}"
             )
 
 
@@ -182,7 +184,7 @@ def verify(store: Store, mend: Annotated[bool, typer.Option("--repair")] = False
     if not mend and any(finding.can_be_repaired for finding in findings):
         console.errors.print(
             "worldpose verify --repair withdraws damaged results and sets damaged records aside; "
-            "then run the match again"
+            "then run the match with the settings of their runs"
         )
     if findings:
         raise typer.Exit(1)

@@ -158,11 +158,14 @@ def run(
 def _print(record: RunRecord, project: str, seconds: float) -> None:
     by = " until the review" if record.waiting and not record.failed else " by that"
     blocked = f" and {len(record.blocked)} blocked{by}" if record.blocked else ""
+    took = f"the whole command, with the start of Prefect: {seconds:.1f} s"
+    if record.seconds > seconds:  # nothing was stale: the record is of an earlier command
+        took = f"this command: {seconds:.1f} s"
     console.line(
         f"run {record.run_id} of {record.match_id} is {record.state}: "
         f"{len(record.executed)} computed, {len(record.reused)} reused, "
-        f"{len(record.failed)} failed{blocked}, gates {record.gates}, {record.seconds:.1f} s; "
-        f"the whole command, with the start of Prefect: {seconds:.1f} s"
+        f"{len(record.failed)} failed{blocked}, gates {record.gates}, "
+        f"{record.seconds:.1f} s; {took}"
     )
     count = len(record.usability.reservations)
     verdict = f"{record.usability.verdict}{f' ({count} below)' if count else ''}"

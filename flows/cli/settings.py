@@ -16,6 +16,7 @@ from flows.layers import (
     SETTINGS_LOCK,
     VENUES,
     Layer,
+    check_general,
     list_venues,
     match_layer,
     project_layers,
@@ -25,7 +26,7 @@ from flows.layers import (
 )
 from flows.registering import find_match, find_registration
 from flows.settings import as_text, known_settings, parse_value, require_known, resolve, save_layer
-from worldpose.errors import UsageError, unknown_name
+from worldpose.errors import InputError, UsageError, unknown_name
 from worldpose.ingest.match_folder import read_spec
 from worldpose.store.runs import alone
 from worldpose.store.store import Store
@@ -158,7 +159,13 @@ def change_layer(
                     found=repr(text),
                     todo="Write it as in: --set detection.stride=2.",
                 )
+            require_known(key, f"--set {text}")
             values[key] = parse_value(value, key)
+            try:
+                check_general(name, "--set", {key: values[key]})
+            except InputError as error:
+                todo = f"{error.todo} {known_settings()[key]['about']}"
+                raise UsageError(f"--set {text}", error.expected, error.found, todo) from error
         for key in removed:
             if key not in values:
                 raise unknown_name(f"--unset {key}", key, values)

@@ -14,6 +14,7 @@ import secrets
 import shutil
 import socket
 import sqlite3
+import ssl
 import subprocess
 import sys
 import tempfile
@@ -325,14 +326,21 @@ def require_login(address: str) -> None:
         return  # the next request reports why it does not answer
 
 
-def problem_at(address: str) -> str:
+def problem_at(address: str, certificate: str | None = None) -> str:
     """Return why a server does not answer with 200 within seconds; empty if it does.
 
-    Proxies are only asked about other machines.
+    Proxies are only asked about other machines. `certificate` is the file of that server's own
+    certificate, which can be self-signed, and for another name than that of `address`.
     """
     is_here = urlsplit(address).hostname in LOOPBACK_NAMES
-    opener = urllib.request.build_opener(*[urllib.request.ProxyHandler({})] * is_here)
+    handlers: list[urllib.request.BaseHandler] = [urllib.request.ProxyHandler({})] * is_here
     try:
+        if certificate is not None:
+            trust = ssl.create_default_context(cafile=certificate)
+            trust.check_hostname = False
+            trust.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
+            handlers.append(urllib.request.HTTPSHandler(context=trust))
+        opener = urllib.request.build_opener(*handlers)
         with opener.open(address, timeout=5) as answer:
             return "" if answer.status == 200 else f"{address} answers {answer.status}"
     except urllib.error.HTTPError as error:

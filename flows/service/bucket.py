@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 from typing import Final
 
 from data_contracts.operations import Arrival
-from flows.service.inbox import REMOVED, change_state, match_id_in
+from flows.service.inbox import REMOVED, change_state, match_id_in, printable
 from flows.service.layout import PRIORITIES, StateFolder
 from worldpose.errors import InputError, UsageError, WorldposeError
 from worldpose.formats.files import whole_file
@@ -82,7 +82,7 @@ class BucketInbox:
                     self._keep(name, [fingerprint, self._copied[name][-1]])
             except (WorldposeError, OSError) as error:
                 refused = str(error)
-            self._tell(name, refused, taken.get(ascii(name)[1:-1]))
+            self._tell(name, refused, taken.get(printable(name)))
         return fetched
 
     def _tell(self, name: str, refused: str | None, known: Arrival | None) -> None:
@@ -141,7 +141,7 @@ class BucketInbox:
 
         Rules of a bucket and tidy-ups remove objects, and names are used again.
         """
-        target, arrival = self.inbox / name, self._taken_in().get(ascii(name)[1:-1])
+        target, arrival = self.inbox / name, self._taken_in().get(printable(name))
         if arrival is None:
             return None
         files = {it.relative_to(target).as_posix() for it in target.rglob("*") if it.is_file()}

@@ -17,7 +17,6 @@ from flows.service.match_runs import MatchRuns
 from flows.service.plan import Schedule, ServePlan, deployment_name
 from flows.service.recovery import adopt_due
 from flows.service.worker import JOB_TEMPLATE, Installed, ServedWorker
-from worldpose.errors import InputError
 
 MODULE: Final = "flows.service.deployed"
 """Module of the deployed flows; it starts Prefect's task runner when it is imported."""
@@ -85,12 +84,8 @@ def install(plan: ServePlan) -> dict[str, Installed]:
 
     Returns:
         Flows that a worker can run, by deployment id.
-
-    Raises:
-        InputError: another project has deployments of this name at the server.
     """
     prefect = MatchRuns.of_plan(plan)
-    _refuse_other_project(prefect, plan)
     matches, arrivals = pools(plan)
     for pool, limit, about in (
         (matches, plan.max_concurrent, "Matches, urgent ones first"),
@@ -191,23 +186,6 @@ def _update(
     wanted = {**wanted, "parameters": {**known, **wanted["parameters"]}}
     if any(there[name] != value for name, value in wanted.items()):
         prefect.ask(place, wanted, method="PATCH")
-
-
-def _refuse_other_project(prefect: PrefectApi, plan: ServePlan) -> None:
-    there = prefect.deployment(plan.match_deployment)
-    if there is None or there["parameters"].get("project") == plan.project:
-        return
-    raise InputError(
-        f"deployment {plan.match_deployment} at {plan.prefect}",
-        expected=f"that of project {plan.project}",
-        found=f"that of {there['parameters'].get('project')}",
-        todo=(
-            f"Was the project moved? Move it back, or remove {plan.state}: nothing is lost "
-            "but Prefect's history, and what lies in the inbox is taken in once more."
-            if plan.owns_prefect
-            else "Give this project's deployments another name with --name."
-        ),
-    )
 
 
 def _install(prefect: PrefectApi, kind: str, name: str, values: dict[str, Any], **new: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -15,10 +15,13 @@ from flows.orchestration.prefect_api import PrefectApi, UnreachablePrefectError,
 from flows.orchestration.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN, problem_at
 from flows.service.alerts import STANDSTILLS, kept_alerts
 from flows.service.layout import StateFolder, disk_answers, is_alive
-from flows.service.plan import FLOWS, deployment_name
+from flows.service.plan import FLOWS, ServePlan, deployment_name
+from worldpose.errors import InputError
 
 WORKER_SECONDS: Final = 90.0
 """Without a heartbeat for so long, a worker counts as lost; it sends one every 30 s."""
+BEGIN_SECONDS: Final = 300.0
+"""Start timeout: the first start creates a database, and machines are busy [s]."""
 LOW_DISK_GB: Final = 1.0
 """With less free space, computation will soon fail [GB]."""
 AGAIN: Final = "End worldpose serve and begin it again: it installs what is missing."
@@ -36,8 +39,10 @@ class Finding:
 
 def check(state: StateFolder) -> list[Finding]:
     """Check everything that `worldpose serve` runs, dependencies first."""
-    serving = state.read_serving()
-    if serving is None or not state.is_held("serve"):
+    serving, is_held = state.read_serving(), state.is_held("serve")
+    if serving is None and is_held:
+        return [Finding("serve", False, "it starts", "Wait until it has printed its addresses.")]
+    if serving is None or not is_held:
         was = "it was killed" if serving is not None else "it was not started, or ended"
         begin = "Begin it: worldpose serve, with the project and options that it should have."
         return [Finding("serve", False, f"nothing serves this project: {was}", begin)]
@@ -45,7 +50,11 @@ def check(state: StateFolder) -> list[Finding]:
     found = [Finding("serve", True, f"process {pid}, since {serving.started_at:%Y-%m-%d %H:%M}Z")]
     found += _check_processes(state, serving)
     found += _check_servers(state, serving)
-    found += at_prefect(serving, state.client_login(serving))
+    found += at_prefect(state, serving)
+    seconds = (datetime.now(UTC) - serving.started_at).total_seconds()
+    if seconds < BEGIN_SECONDS:
+        wait = f"It began {seconds:.0f} s ago, and may still start: wait, and check again. If not: "
+        found = [it if it.is_well else replace(it, remedy=wait + it.remedy) for it in found]
     found += _check_progress(state)
     found.append(_check_inbox(state, serving))
     free = shutil.disk_usage(state.folder).free / 1e9
@@ -70,7 +79,7 @@ def _check_servers(state: StateFolder, serving: Serving) -> Iterator[Finding]:
             origin = "/".join(service.address.split("/")[:3])
             addresses[name] = origin.replace("0.0.0.0", "127.0.0.1") + path
     for name, address in addresses.items():
-        problem = problem_at(address)
+        problem = problem_at(address, serving.certificate if name == "pages" else None)
         if not problem:
             yield Finding(name, True, f"answers at {address}")
         elif name == "prefect" and not serving.owns_prefect:
@@ -80,23 +89,47 @@ def _check_servers(state: StateFolder, serving: Serving) -> Iterator[Finding]:
             yield Finding(name, False, problem, f"See {log}; end worldpose serve and begin again.")
 
 
-def at_prefect(serving: Serving, login: str | None) -> Iterator[Finding]:
-    """Check that deployments exist, and that a worker takes their runs."""
-    prefect = PrefectApi(serving.prefect, login, tries=1)
+def of_other_project(
+    prefect: PrefectApi, serving: Serving | ServePlan, state: StateFolder
+) -> InputError | None:
+    """Return the refusal of a server where another project has deployments of this name."""
+    name = deployment_name(serving.name, "match")
+    there = prefect.deployment(name)
+    if there is None or there["parameters"].get("project") == serving.project:
+        return None
+    return InputError(
+        f"deployment {name} at {serving.prefect}",
+        expected=f"that of project {serving.project}",
+        found=f"that of {there['parameters'].get('project')}",
+        todo=(
+            f"Was the project moved? Move it back, or remove {state.folder}: nothing is lost "
+            "but Prefect's history, and what lies in the inbox is taken in once more."
+            if serving.owns_prefect
+            else "Give this project's deployments another name with --name."
+        ),
+    )
+
+
+def at_prefect(state: StateFolder, serving: Serving) -> Iterator[Finding]:
+    """Check that its own deployments exist, and that a worker takes their runs."""
+    prefect = PrefectApi(serving.prefect, state.client_login(serving), tries=1)
     try:
         names = {flow: deployment_name(serving.name, flow) for flow in FLOWS}
         missing = [flow for flow, name in names.items() if prefect.deployment(name) is None]
         words = f"missing: {', '.join(missing)}" if missing else ", ".join(FLOWS)
-        yield Finding("deployments", not missing, words, AGAIN)
+        if (refusal := of_other_project(prefect, serving, state)) is not None:
+            words = f"expected {refusal.expected}, found {refusal.found}"
+            yield Finding("deployments", False, words, refusal.todo)
+        else:
+            yield Finding("deployments", not missing, words, AGAIN)
         for pool in (serving.name, f"{serving.name}-arrivals"):
             yield check_worker(prefect, pool)
     except UnreachablePrefectError as error:
         variable = SERVER_LOGIN if serving.owns_prefect else CLIENT_LOGIN
-        remedy = "Fix prefect first."
+        remedy = "Fix prefect first; if it is well, it is busy: check again."
         if error.status == 401:
             remedy = f"Set {variable} as it was when the service began."
-        yield Finding("deployments", False, f"Prefect {error.problem}", remedy)
-        return
+        yield Finding("deployments", False, f"unknown: Prefect's API {error.problem}", remedy)
 
 
 def check_worker(prefect: PrefectApi, pool: str) -> Finding:

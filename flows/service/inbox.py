@@ -156,7 +156,14 @@ def _sums(file: Path) -> Iterator[tuple[str, str]]:
 def _entries(folder: Path, prefix: str, priority: Priority) -> Iterator[Entry]:
     for path in sorted(folder.iterdir()):
         if not path.name.startswith("."):
-            yield Entry(path, prefix + ascii(path.name)[1:-1], priority)
+            yield Entry(path, prefix + printable(path.name), priority)
+
+
+def printable(name: str) -> str:
+    """Return a name with its backslashes, control characters and undecodable bytes escaped."""
+    return "".join(
+        each if each.isprintable() and each != "\\" else ascii(each)[1:-1] for each in name
+    )
 
 
 def _is_match(folder: Path) -> bool:

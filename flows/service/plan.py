@@ -27,6 +27,7 @@ from flows.service.layout import StateFolder
 from flows.web.proxy import TOKEN_LENGTH
 from worldpose.errors import UsageError
 from worldpose.formats.files import whole_file
+from worldpose.store.blobs import storage_errors
 
 FLOWS = ("match", "ingest", "reprocess", "release", "finetune")
 """Flows that the Prefect server offers, known without importing Prefect."""
@@ -127,11 +128,6 @@ class ServePlan(Record):
         is_here = self.host in ("127.0.0.1", "localhost", "::1")
         name = self.host if is_here or not self.names else self.names[0]
         return f"{scheme}://{name}:{self.pages_port}"
-
-    @property
-    def match_deployment(self) -> str:
-        """Name of the Prefect deployment that processes matches."""
-        return deployment_name(self.name, "match")
 
 
 SCHEDULED: Final = ("ingest", "reprocess")
@@ -285,8 +281,9 @@ def kept_secret(file: Path, make: Callable[[], str]) -> str:
 
     A secret that other users can read or write is replaced. Only this user can read its folder.
     """
-    file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    file.parent.chmod(0o700)
+    with storage_errors(str(file.parent)):
+        file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        file.parent.chmod(0o700)
     try:
         with os.fdopen(os.open(file, os.O_RDONLY | os.O_NOFOLLOW)) as opened:
             known = os.fstat(opened.fileno())
@@ -296,7 +293,7 @@ def kept_secret(file: Path, make: Callable[[], str]) -> str:
     except OSError:
         pass  # missing, a link, or another user's
     secret = make()
-    with whole_file(file) as draft:
+    with storage_errors(str(file)), whole_file(file) as draft:
         draft.touch(mode=0o600)
         draft.chmod(0o600)
         draft.write_text(f"{secret}\n")

@@ -19,6 +19,7 @@ from typing import Final
 from urllib.parse import urlsplit
 
 from data_contracts.operations import Service, Serving
+from flows.orchestration.prefect_api import PrefectApi
 from flows.orchestration.prefect_environment import (
     begin_database,
     keep_database,
@@ -27,19 +28,18 @@ from flows.orchestration.prefect_environment import (
     require_login,
     served_environment,
 )
-from flows.service.health import at_prefect
+from flows.service.health import BEGIN_SECONDS, at_prefect, of_other_project
 from flows.service.layout import PRIORITIES
 from flows.service.plan import Secrets, ServePlan
 from flows.web.http_server import require_free_ports
 from worldpose.errors import UsageError, WorldposeError
+from worldpose.store.blobs import storage_errors
 from worldpose.store.store import Store
 
 LONGEST_PAUSE: Final = 60.0
 """Between two starts of a process that keeps ending [s]."""
 STEADY_SECONDS: Final = 120.0
 """A process that ran for so long is restarted at once."""
-BEGIN_SECONDS: Final = 300.0
-"""Start timeout: the first start creates a database, and machines are busy [s]."""
 END_SECONDS: Final = 15.0
 """Time to end before a process is killed."""
 LOG_BYTES: Final = 10_000_000
@@ -123,6 +123,7 @@ class _Supervisor:
             name=plan.name,
             prefect=plan.prefect,
             owns_prefect=plan.owns_prefect,
+            certificate=None if plan.certificate is None else str(plan.certificate.resolve()),
             services={**services, "serve": Service(pid=os.getpid())},
             started_at=datetime.now(UTC),
         )
@@ -179,10 +180,11 @@ def serve(plan: ServePlan, secrets: Secrets, ready: Callable[[], None], tell: Te
         WorldposeError: a part does not answer in time.
     """
     Store.create(plan.project)
-    for priority in PRIORITIES:
-        (plan.inbox / ("" if priority == "normal" else priority)).mkdir(parents=True, exist_ok=True)
     state = plan.state_folder
-    state.folder.mkdir(parents=True, exist_ok=True)
+    queues = ["" if priority == "normal" else priority for priority in PRIORITIES]
+    for folder in (*(plan.inbox / each for each in queues), state.folder):
+        with storage_errors(str(folder)):
+            folder.mkdir(parents=True, exist_ok=True)
     with state.only_one("serve", wait=False) as is_alone:
         if not is_alone:
             raise UsageError(
@@ -228,7 +230,7 @@ def bound_log(log: Path) -> None:
 
 
 def _bring_up(supervisor: _Supervisor, told: threading.Event) -> None:
-    plan = supervisor.plan
+    plan, state = supervisor.plan, supervisor.plan.state_folder
     local = "127.0.0.1" if plan.host in ("0.0.0.0", "::") else plan.host
 
     def wait_for(part: _Part, health: str) -> None:
@@ -248,15 +250,18 @@ def _bring_up(supervisor: _Supervisor, told: threading.Event) -> None:
         )
     else:
         require_login(plan.prefect)
+    prefect = PrefectApi(plan.prefect, supervisor.secrets.prefect)
+    if not told.is_set() and (refusal := of_other_project(prefect, plan, state)):
+        raise refusal
     pages = supervisor.start("pages", plan.pages)
     worker = supervisor.start("worker")
     watch = supervisor.start("watch", f"http://{plan.host}:{plan.metrics_port}/metrics")
-    serving, login = supervisor.write(), supervisor.secrets.prefect
+    serving = supervisor.write()
     if plan.certificate is None:
         wait_for(pages, f"http://{local}:{plan.pages_port}/api/health")
     wait_for(watch, f"http://{local}:{plan.metrics_port}/health")
 
-    worker.wait_until(lambda: all(it.is_well for it in at_prefect(serving, login)), told)
+    worker.wait_until(lambda: all(it.is_well for it in at_prefect(state, serving)), told)
 
 
 def environment_of(plan: ServePlan) -> dict[str, str]:

@@ -52,6 +52,7 @@ def routes(context: PageContext) -> APIRouter:
             "matches": [_as_json(each) for each in rows],
             "pages": _pages(found),
             "arrivals": [each.model_dump(mode="json") for each in _arrivals(context)],
+            "alerts": _alerts(context),
         }
 
     @router.get("/status")
@@ -64,15 +65,13 @@ def routes(context: PageContext) -> APIRouter:
         page = 1 + names.index(match) // PAGE if match in names else page
         page = min(max(page, 1), _pages(found))
         running = context.continuing.running()
-        kept = kept_alerts(served_state(context.store.url)).values()
-        alerts = [each for each in kept if each["alert"] != "digest"]
         text = status_html(
             _rows(context, found, page),
             _arrivals(context),
             dashboard,
             inbox=inbox,
             opened=match,
-            alerts=alerts,
+            alerts=_alerts(context),
             counts=Counter(StatusRow(it, _running(it, running)).kind for it in found),
             place=(page, _pages(found)),
         )
@@ -229,6 +228,11 @@ def _as_json(row: StatusRow) -> dict[str, Any]:
         **asdict(cost_of(match)),
         **match.model_dump(mode="json", include=about),
     }
+
+
+def _alerts(context: PageContext) -> list[dict[str, Any]]:
+    kept = kept_alerts(served_state(context.store.url)).values()
+    return [each for each in kept if each["alert"] != "digest"]
 
 
 def _arrivals(context: PageContext) -> list[Arrival]:

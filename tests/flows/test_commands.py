@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 
@@ -44,6 +45,20 @@ def test_every_command_loads_and_is_listed_with_its_help(name):
 def test_runs_and_pages_import_nothing_that_only_draws_or_opens_results(modules, unwanted):
     script = f"import sys, {modules}\nassert not set({unwanted.split()}) & set(sys.modules)\n"
     subprocess.run([sys.executable, "-c", script], check=True)
+
+
+@pytest.mark.parametrize(
+    ("stated", "told"),
+    [
+        ("exports=joints", 'exports=["joints"]'),
+        ("pitch=fifa", 'pitch={"template": "football"}'),
+        ("sides=left", 'sides={"cam1": "left"}'),
+        ("nonsense=2", "expected the name of a setting, found 'nonsense'. List all settings"),
+    ],
+)
+def test_a_wrong_setting_is_told_its_form_or_where_all_are(stated, told, store):
+    with pytest.raises(UsageError, match=re.escape(told)):
+        raise said(store, "settings", "--set", stated).exception
 
 
 @pytest.mark.parametrize("option", ["--help", "--version"])
@@ -187,7 +202,7 @@ def test_the_exit_code_of_a_run_says_how_it_ended(state, code, told, store, tmp_
     monkeypatch.setattr(run_command, "run_match", lambda *_: ended(state))
     answer = said(store, "run", "a")
     assert (answer.exit_code, told in answer.stdout) == (code, True)
-    assert "1.0 s; the whole command, with the start of Prefect: 0." in answer.stdout
+    assert "1.0 s; this command: 0." in answer.stdout  # less than its run took: an earlier one
     as_json = said(store, "run", "a", "--json")
     assert as_json.exit_code == code
     assert json.loads(as_json.stdout)["failed"] == (state in ("failed", "partial"))
@@ -210,7 +225,10 @@ def test_a_run_that_has_not_ended_is_told_and_listed(store, tmp_path):
     told = r"run 1 of match a .*one of 0002, found an unfinished run. List them: worldpose status a"
     with pytest.raises(InputError, match=told):
         raise said(store, "diff", "a/1", "a/2").exception
-    assert "a: runs that ended: 0002; that have not: 0001\n" in said(store, "status", "a").stdout
+    assert said(store, "settings", "a", "--set", "detection.batch=2").exit_code == 0
+    told = said(store, "status", "a").stdout
+    assert "a: runs that ended: 0002; that have not: 0001\n" in told
+    assert "settings of its next run: detection.batch=2\n" in told
     assert "forget it: worldpose gc --delete --forget a/0001\n" in said(store, "gc").stdout
     removed = said(store, "gc", "--delete", "--forget", f"a/{killed}").stdout
     assert "removed: 1 x reservation of a dead run (" in removed

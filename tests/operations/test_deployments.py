@@ -3,7 +3,6 @@
 import importlib
 import os
 import platform
-import re
 import shutil
 from contextvars import copy_context
 from datetime import UTC, datetime, timedelta
@@ -35,7 +34,7 @@ from flows.service.run_queue import beating, queued_run
 from flows.service.worker import RefusedRunError, ServedWorker, require_installed
 from flows.web import app_context
 from flows.web.app_context import Continuing
-from worldpose.errors import InputError, UsageError
+from worldpose.errors import UsageError
 from worldpose.review.journal import read_journal
 from worldpose.store.runs import alone
 from worldpose.store.store import Store
@@ -317,15 +316,6 @@ def test_a_release_lies_in_the_project_under_a_name_that_leads_nowhere_else(tmp_
     for bad in ("", "../x", "/x", "a/b", ".hidden"):
         with pytest.raises(UsageError, match="name"):
             release_folder(store, "m", bad, None)
-
-
-def test_another_project_of_the_same_name_is_refused(plan):
-    for changes, advice in (
-        ({"project": "/another"}, f"remove {plan.state}"),
-        ({"project": "/another", "owns_prefect": False}, "--name"),
-    ):
-        with pytest.raises(InputError, match=re.escape(advice)):
-            install(plan.model_copy(update=changes))
 
 
 @pytest.fixture

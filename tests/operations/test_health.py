@@ -5,9 +5,13 @@ import os
 import re
 import shutil
 import socket
+import ssl
 from contextlib import ExitStack
 from datetime import UTC, datetime
+from functools import partial
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from threading import Thread
 from types import SimpleNamespace
 
 import pytest
@@ -20,20 +24,23 @@ from data_contracts.operations import Arrival, MatchSummary, Service, Serving, U
 from flows.cli import options
 from flows.cli.project import status
 from flows.cli.serve import serve
+from flows.orchestration.prefect_api import PrefectApi
 from flows.orchestration.prefect_environment import CLIENT_LOGIN
+from flows.orchestration.private_cluster import write_certificate
 from flows.overview import Overview
 from flows.service import health, layout
+from flows.service import serving as supervising
 from flows.service.alerts import Alert, AlertDispatcher
-from flows.service.health import _check_inbox, check
+from flows.service.health import _check_inbox, _check_servers, at_prefect, check
 from flows.service.layout import StateFolder
 from flows.service.match_runs import match_runs_of
 from flows.service.metrics import ProjectMetrics, exposition, metrics_app
-from flows.service.plan import ServePlan
+from flows.service.plan import Secrets, ServePlan
 from flows.service.status_page import StatusRow, status_html
 from flows.web.access import access_for
 from flows.web.app import create_app
 from flows.web.http_server import require_free_ports
-from worldpose.errors import InputError
+from worldpose.errors import InputError, StoreError
 from worldpose.store.store import Store
 
 
@@ -62,6 +69,10 @@ def test_what_was_never_started_or_killed_is_said(state, tmp_path):
     (finding,) = check(state)
     assert (finding.part, finding.is_well) == ("serve", False)
     assert "not started" in finding.state
+    state.folder.mkdir()
+    with state.only_one("serve", wait=False):
+        assert [each.state for each in check(state)] == ["it starts"]
+    (state.folder / "serve.lock").unlink()
     state.write_serving(serving(tmp_path, "http://127.0.0.1:9/api"))
     (finding,) = check(state)
     assert "killed" in finding.state
@@ -96,9 +107,45 @@ def test_every_part_that_is_not_well_says_how_to_mend_it(server, state, tmp_path
             state.write_arrival(Arrival(name=name, state=seen, changed_at=datetime.now(UTC)))
         found = by_part(check(state))
         assert "Start the Prefect server" in found["prefect"].remedy
-        assert found["deployments"].remedy == "Fix prefect first."
+        assert "began 0 s ago" in found["deployments"].remedy  # it may start yet
+        assert "Fix prefect first; if it is well" in found["deployments"].remedy
         inbox = found["inbox"]
         assert (inbox.is_well, inbox.state) == (True, "3 known, 2 refused")
+
+
+def test_a_moved_project_is_refused_before_its_worker_starts(state, tmp_path, monkeypatch):
+    there = {"parameters": {"project": "/before/the/move"}}
+    monkeypatch.setattr(PrefectApi, "deployment", lambda self, name: there)
+    for name in ("problem_at", "require_login", "_require_free_ports"):
+        monkeypatch.setattr(supervising, name, lambda _: "")
+    own, inbox = serving(tmp_path, "http://127.0.0.1:9/api"), tmp_path / "inbox"
+    about = {"project": own.project, "name": own.name, "prefect": own.prefect}
+    plan = ServePlan(**about, inbox=inbox, state=state.folder, owns_prefect=False)
+    begin = partial(supervising.serve, plan, Secrets("", "", None), lambda: None, print)
+    inbox.touch()  # its folders cannot be made, as for want of permission
+    with pytest.raises(StoreError, match=r"run again\. Published results are unchanged"):
+        begin()
+    inbox.unlink()
+    with pytest.raises(InputError, match=r"found that of /before/the/move\. .*--name"):
+        begin()
+    assert not state.logs.exists()
+    found = next(at_prefect(state, own.model_copy(update={"owns_prefect": True})))
+    assert (found.is_well, "/before/the/move" in found.state) == (False, True)
+    assert f"Move it back, or remove {state.folder}" in found.remedy
+
+
+def test_pages_are_asked_with_their_own_certificate(state, tmp_path):
+    write_certificate(tmp_path)
+    own, key = tmp_path / "certificate.pem", tmp_path / "key.pem"
+    with HTTPServer((HOST, 0), BaseHTTPRequestHandler) as pages:
+        tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        tls.load_cert_chain(own, key)
+        pages.socket = tls.wrap_socket(pages.socket, server_side=True)
+        Thread(target=pages.handle_request, daemon=True).start()
+        at = Service(pid=os.getpid(), address=f"https://{HOST}:{pages.server_port}/login")
+        served = serving(tmp_path, "http://127.0.0.1:9/api", pages=at)
+        served = served.model_copy(update={"certificate": str(own)})
+        assert by_part(_check_servers(state, served))["pages"].state.endswith("answers 501")
 
 
 HOST = "127.0.0.1"
@@ -325,9 +372,10 @@ def test_strangers_see_nothing_and_others_the_matches_by_stage(app, project_copy
     browser = TestClient(app, base_url="http://127.0.0.1:8571")
     for path in ("/status", "/api/status", "/status/page.css", "/status/page.js"):
         assert browser.get(path).status_code == 401
-    StateFolder(project_copy / "operations").write_arrival(
-        arrival(name=EVIL, state="refused", reason=EVIL)
-    )
+    state = StateFolder(project_copy / "operations")
+    state.write_arrival(arrival(name=EVIL, state="refused", reason=EVIL))
+    told = dict.fromkeys(("alert", "match", "text", "link", "since"), "x") | {"told_by": []}
+    state.alerts.write_text(json.dumps({"disk": told, "digest": {**told, "alert": "digest"}}))
     assert browser.post("/api/login", json={"who": "Ada", "token": TOKEN}).status_code == 200
     page = browser.get("/status")
     assert "default-src 'none'" in page.headers["content-security-policy"]
@@ -350,6 +398,7 @@ def test_strangers_see_nothing_and_others_the_matches_by_stage(app, project_copy
     assert {each["state"] for each in cameras} == {"done"}
     assert all(each["seconds"] > 0 for each in cameras)
     assert [each["state"] for each in answer["arrivals"]] == ["refused"]
+    assert answer["alerts"] == [told]
 
 
 def test_a_match_that_cannot_be_read_hides_no_other(project_copy):

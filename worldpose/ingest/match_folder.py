@@ -406,23 +406,24 @@ def _require_one_view(folder: Path, spec: MatchSpec) -> None:
 def _require_footage(
     folder: Path, spec: MatchSpec, detections: Mapping[str, Path], videos: Mapping[str, Path]
 ) -> None:
-    for camera in spec.static_cameras:
-        if camera.id not in detections and camera.id not in videos:
-            todo = f"Add videos/{camera.id}.mp4 or detections/{camera.id}.json (or .npz)"
-            others = sorted((folder / "videos").glob(f"{camera.id}.*"))  # of an unusual suffix
-            if named := [file.name for file in others if file.stem == camera.id]:
-                todo += f", or name it in match.yaml: `video: videos/{named[0]}`"
-            expected = f"footage of every static camera of match.yaml, also of {camera.id}"
-            found = f"missing camera {camera.id}; there: {_list_names({**videos, **detections})}"
-            raise InputError(str(folder), expected, found, f"{todo}.")
-    for name, view in spec.broadcast_views.items():
-        if name not in detections and name not in videos:
-            expected = f"footage of broadcast camera {view.camera.id} for clip {view.clip.id}"
-            todo = (
-                f"Add broadcast/{name}.mp4 or detections/{name}.json (or .npz), or "
-                "take the camera out of `broadcast` of the clip."
-            )
-            raise InputError(str(folder), expected, "none", todo)
+    there = {**videos, **detections}
+    if absent := [each.id for each in spec.static_cameras if each.id not in there]:
+        todo = f"Add videos/{absent[0]}.mp4 or detections/{absent[0]}.json (or .npz)"
+        others = sorted((folder / "videos").glob(f"{absent[0]}.*"))  # of an unusual suffix
+        if named := [file.name for file in others if file.stem == absent[0]]:
+            todo += f", or name it in match.yaml: `video: videos/{named[0]}`"
+        todo += ", and so for each camera that is missing." if len(absent) > 1 else "."
+        expected = "footage of every static camera of match.yaml"
+        found = f"missing camera {', '.join(absent)}; there: {_list_names(there)}"
+        raise InputError(str(folder), expected, found, todo)
+    views = [(name, view) for name, view in spec.broadcast_views.items() if name not in there]
+    if views:
+        named = [f"broadcast camera {it.camera.id} for clip {it.clip.id}" for _, it in views]
+        todo = (
+            f"Add broadcast/{views[0][0]}.mp4 or detections/{views[0][0]}.json (or .npz), or "
+            "take the camera out of `broadcast` of the clip."
+        )
+        raise InputError(str(folder), f"footage of {', '.join(named)}", "none", todo)
 
 
 def _list_names(names: Mapping[str, object]) -> str:

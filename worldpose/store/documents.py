@@ -211,6 +211,6 @@ def verify_published(blobs: Blobs, result: ResultId, file: StoredFile) -> None:
 def corruption_error(blobs: Blobs, path: str, found: str) -> CorruptionError:
     """Return the error of a published file that is not as it was."""
     return CorruptionError(
-        f"{blobs.url}/{path} has changed since its publication: {found}. Run "
-        "`worldpose verify --repair` to find and repair all damage."
+        f"{blobs.url}/{path} has changed since its publication: {found}.",
+        "Run `worldpose verify --repair` to find and repair all damage.",
     )

@@ -152,7 +152,8 @@ def _check_result(
         manifest = store.manifest(result.match_id, result.stage, result.unit, result.key)
     except (StoreError, InputError) as error:
         is_damage = isinstance(error, CorruptionError)  # not a disk's error, or another version
-        yield Finding(result.manifest_path, str(error), result if is_damage else None)
+        problem = getattr(error, "problem", str(error))
+        yield Finding(result.manifest_path, problem, result if is_damage else None)
         return
     if content_digest(manifest.files) != manifest.content:
         yield Finding(
@@ -163,7 +164,8 @@ def _check_result(
             verify_published(store.blobs, result, file)
         except StoreError as error:
             is_damage = isinstance(error, CorruptionError)
-            yield Finding(f"{result.path}/{file.path}", str(error), result if is_damage else None)
+            problem = getattr(error, "problem", str(error))
+            yield Finding(f"{result.path}/{file.path}", problem, result if is_damage else None)
     known = {
         f"{result.path}/{name}" for name in (MANIFEST, *(file.path for file in manifest.files))
     }
@@ -251,4 +253,9 @@ def _check_named_results(
     for name, key in record.results.items():
         result = ResultId.from_name(record.match_id, name, key)
         if result not in published:
-            yield Finding(path, f"names {result.path}, which is not published; run the match again")
+            problem = (
+                f"names {result.path}, which is not published; a run of the match with the "
+                "settings of this run publishes it again; or unpin this run, and forget it: "
+                f"worldpose gc --forget {record.match_id}/{record.run_id} --delete"
+            )
+            yield Finding(path, problem)

@@ -164,8 +164,8 @@ class Store:
         named = (recipe.match_id, recipe.stage, recipe.unit, recipe_key(recipe))
         if named != (match_id, stage, unit, key) or manifest.key != key:
             raise CorruptionError(
-                f"{where} is the manifest of another result: {'/'.join(named)}. Run `worldpose "
-                "verify --repair`."
+                f"{where} is the manifest of another result: {'/'.join(named)}.",
+                "Run `worldpose verify --repair`.",
             )
         return manifest
 

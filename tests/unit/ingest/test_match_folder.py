@@ -78,6 +78,8 @@ def test_static_camera_without_footage_is_missing(match_folder):
     error = refusal(match_folder)
     assert "missing camera cam2; there: cam1" in error.found
     assert "videos/cam2.mp4" in error.todo
+    (match_folder / "detections" / "cam1.npz").unlink()
+    assert "missing camera cam1, cam2; there: " in refusal(match_folder).found
 
 
 def test_a_folder_of_images_is_footage_unless_empty(match_folder, edit):

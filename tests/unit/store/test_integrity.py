@@ -160,7 +160,10 @@ def test_whole_file_in_a_wrong_place_is_found(folder_store):
 def test_repair_withdraws_what_is_damaged_and_nothing_else(full):
     path = f"{ResultId(*place()).path}/joints/c/0/0/0"
     full.blobs.put(path, b"changed")
-    assert repair(full, verify(full)) == ((ResultId(*place()),), ())
+    findings = verify(full)
+    assert "has changed" in findings[0].problem and "verify" not in findings[0].problem
+    assert repair(full, findings) == ((ResultId(*place()),), ())
+    assert "gc --forget final/0001" in verify(full)[0].problem  # other settings do not mend it
     assert not full.has(*place())
     assert full.has(*place(sample_recipe("late")))
     publish(full)
