@@ -34,9 +34,13 @@ def _no_people() -> NDArray[np.integer]:
 
 
 def _as_floats(values: ArrayLike) -> AnyFloats:
-    """Return an array of float32, or of float64 if the values are of neither."""
+    """Return an array of float32, or of float64 if the values are of neither, in rows of memory.
+
+    Kernels are compiled again for every other layout.
+    """
     array = np.asarray(values)
-    return array.astype(np.float32 if array.dtype.type is np.float32 else np.float64, copy=False)
+    kind = np.float32 if array.dtype.type is np.float32 else np.float64
+    return array.astype(kind, order="C", copy=False)
 
 
 @dataclass(frozen=True, eq=False)
