@@ -16,14 +16,7 @@ from data_contracts.evaluation import Evaluation, MethodScore
 from worldpose.body.body_file import find_body
 from worldpose.body.model import BodyModel
 from worldpose.dataset.check import check_clip
-from worldpose.dataset.contents import (
-    SUBMISSIONS,
-    PointSource,
-    ShippedClip,
-    camera_files,
-    list_clips,
-    read_clip,
-)
+from worldpose.dataset.contents import SUBMISSIONS, ShippedClip, camera_files, list_clips, read_clip
 from worldpose.dataset.faults import LIMITS, camera_faults
 from worldpose.dataset.manifest import FRAME_RATES, stated_rate
 from worldpose.errors import InputError
@@ -199,7 +192,7 @@ def _read_people(
     shipped = read_clip(folder, clip, clips, find, None, 50.0)
     source = shipped.sources[0]
     if truth is not None:
-        _require_same(str(folder), shipped.sources)
+        _require_same(str(folder), shipped)
     numbered = [each.frames for each in shipped.sources if each.frames is not None]
     first = truth.first if truth else int(numbered[0][0]) if numbered and len(numbered[0]) else 0
     rows = np.arange(len(source.points)) if source.frames is None else source.frames - first
@@ -265,10 +258,10 @@ def _require_metres(mine: _People, true: Floats, distances: Floats) -> None:
             raise wrong(mine.where, "metres", unit, f"Multiply the places by {size:g}.")
 
 
-def _require_same(where: str, sources: tuple[PointSource, ...]) -> None:
+def _require_same(where: str, clip: ShippedClip) -> None:
     """Raise InputError if poses and joints of the same people and frames are others."""
-    first = sources[0]
-    for other in sources[1:]:
+    first, *others = clip.sources
+    for other in others:
         if other.points.shape[:2] == first.points.shape[:2]:
             shared = [name for name in COCO17 if name in {*first.skeleton} & {*other.skeleton}]
             gaps = [first.point(name) - other.point(name) for name in shared]
