@@ -34,9 +34,13 @@ def _no_people() -> NDArray[np.integer]:
 
 
 def _as_floats(values: ArrayLike) -> AnyFloats:
-    """Return an array of float32, or of float64 if the values are of neither."""
+    """Return an array of float32, or of float64 if the values are of neither, in rows of memory.
+
+    Kernels are compiled again for every other layout.
+    """
     array = np.asarray(values)
-    return array.astype(np.float32 if array.dtype.type is np.float32 else np.float64, copy=False)
+    kind = np.float32 if array.dtype.type is np.float32 else np.float64
+    return array.astype(kind, order="C", copy=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,12 +89,14 @@ class KeypointDetections(Generic[Array]):
         keypoints, confidence = _as_floats(keypoints), _as_floats(confidence)
         shape = confidence.shape[:-1]
         nan = np.array(np.nan, dtype=confidence.dtype)
+        number = np.asarray(() if frame is None else frame)
+        whole = number.astype(np.int64)  # others stay, for the functions that take them to refuse
         return KeypointDetections(
             keypoints,
             confidence,
             np.broadcast_to(nan, (*shape, 4)),
             np.broadcast_to(nan, shape),
-            _no_frames() if frame is None else np.asarray(frame, dtype=np.int64),
+            whole if np.array_equal(whole, number) else number,
             _no_people() if detection_index is None else np.asarray(detection_index),
         )
 
@@ -136,7 +142,7 @@ class KeypointDetections(Generic[Array]):
             return KeypointDetections.from_keypoints(np.stack([none, none], axis=-1), none)
         points = tuple(dict.fromkeys(point for each in cameras for point in each.points))
         cameras = [each.with_points(points) for each in cameras]
-        frames = [each.frame if len(each.frame) else np.arange(len(each.score)) for each in cameras]
+        frames = [each.numbers for each in cameras]
         frame = np.unique(np.concatenate(frames))
         most = max(each.score.shape[1] for each in cameras)
         stacked = {}
@@ -148,12 +154,19 @@ class KeypointDetections(Generic[Array]):
                 stacked[name][rows, c, : each.score.shape[1]] = each.arrays()[name]
         return cameras[0].with_arrays(stacked, frame)
 
+    @property
+    def numbers(self) -> Integers:
+        """(frames,), the frame number of each row; none for one image."""
+        shape = self.score.shape
+        return self.frame if len(self.frame) or len(shape) < 2 else np.arange(shape[0])
+
     def __getitem__(self, frames: slice | Integers) -> KeypointDetections:
         """Return the detections of some rows of the frame dimension, in memory."""
         arrays: dict[str, Any] = {name: array[frames] for name, array in self.arrays().items()}
+        numbers = self.numbers
         return KeypointDetections(
             **arrays,
-            frame=self.frame[frames] if len(self.frame) else self.frame,
+            frame=numbers[frames] if len(numbers) else numbers,
             detection_index=self.detection_index[frames]
             if len(self.detection_index)
             else self.detection_index,
@@ -203,14 +216,22 @@ class KeypointDetections(Generic[Array]):
         )
 
     def reindex(self: KeypointDetections, frame: Integers) -> KeypointDetections:
-        """Return the detections on exactly these rising frames (n,); missing frames are NaN."""
-        kept = np.flatnonzero(np.isin(self.frame, frame))
-        row = np.searchsorted(frame, self.frame[kept])
+        """Return the detections on exactly these rising frames (n,); missing frames are NaN.
+
+        Nobody is seen in missing frames: their `detection_index` is -1.
+        """
+        kept = np.flatnonzero(np.isin(self.numbers, frame))
+        row = np.searchsorted(frame, self.numbers[kept])
         padded = {}
         for name, array in self.arrays().items():
             padded[name] = np.full((len(frame), *array.shape[1:]), np.nan, dtype=np.float32)
             padded[name][row] = array[kept]
-        return self.with_arrays(padded, frame)
+        found, index = self.with_arrays(padded, frame), self.detection_index
+        if not len(index):
+            return found
+        people = np.full((len(frame), *index.shape[1:]), -1, dtype=index.dtype)
+        people[row] = index[kept]
+        return found.assign_people(people)
 
     def arrays(self) -> dict[str, Array]:
         """Return the arrays by their names in a store, `KEYPOINT_ARRAYS` and `EXTRA_ARRAYS`."""

@@ -48,7 +48,7 @@ def main() -> None:
             sources={"fps": fps},
             inputs={name: run.record.results[name]},
             settings={"window_s": WINDOW_S},
-            code={"speeds": "1"},
+            code={"speeds": "2"},
             libraries=libraries(),
         )
         key = recipe_key(recipe)
@@ -73,7 +73,7 @@ def measure_speeds(joints: Floats, fps: float) -> tuple[Floats, Floats]:
     speed = np.full(place.shape[:2], np.nan)
     step = np.linalg.norm(place[2 * half :] - place[: -2 * half], axis=-1)
     speed[half:-half] = step * fps / (2 * half)
-    return speed, np.nansum(speed, axis=0) / fps
+    return speed, np.nansum(np.linalg.norm(np.diff(place, axis=0), axis=-1), axis=0)
 
 
 if __name__ == "__main__":

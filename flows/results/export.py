@@ -110,8 +110,12 @@ def export_challenge(
         submissions[view], told = _by_given_rows(origin, clip, truth)
         filled |= {view: told} if any(told.values()) else {}
         path = out / "cameras" / f"{view}.npz"
-        challenge.write_challenge_camera(path, camera, edition)
+        error = challenge.write_challenge_camera(path, camera, edition)
         yield path
+        # Below a tenth of a pixel the lens is that of the run for any use.
+        lens = {view: None if error < 0.1 else {"max_error_px": error}}
+        if (stated := manifests.write_lens_errors(out, lens)) is not None:
+            yield stated
         if edition == 2025:
             together[view] = truth.clip
         else:

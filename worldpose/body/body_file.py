@@ -332,7 +332,7 @@ def _find_installed(name: str, folder: Path | None) -> Path:
             f"body model {name!r}",
             expected=f"one of {', '.join([OPEN_BODY, NARROW_OPEN_BODY, *installed])}",
             found=f"none of that name in {place}",
-            todo="Install it with worldpose body install FILE, name its folder with --body-folder "
-            f"or {BODY_FOLDER_VARIABLE}, or take the open body.",
+            todo="Install it with worldpose body install FILE, name its folder in "
+            f"{BODY_FOLDER_VARIABLE}, or take the open body.",
         )
     return path

@@ -20,6 +20,7 @@ from worldpose.errors import InputError
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera, Cameras
 from worldpose.ingest.clock import row_rate
+from worldpose.tracking.ray_matching import require_clip, require_layout
 from worldpose.tracking.tracker import track_people
 from worldpose.triangulation.estimate import reconstruct_joints
 from worldpose.triangulation.limb_lengths import undo_swaps
@@ -79,16 +80,11 @@ def reconstruct_bodies(
     cameras = Camera.batch(cameras)
     if not isinstance(detections, KeypointDetections):
         for camera in detections:
+            require_layout("reconstruct_bodies", camera)
             _require_rising(camera.frame)
         detections = KeypointDetections.stack(list(detections))
+    require_clip("reconstruct_bodies", cameras, detections, least=2)
     _require_rising(detections.frame)
-    if cameras.batch_shape != detections.score.shape[1:2] or len(cameras.focal) < 2:
-        raise InputError(
-            "reconstruct_bodies",
-            expected="at least two cameras, and detections of each of them",
-            found=f"cameras {cameras.batch_shape}, detections {detections.score.shape}",
-            todo="Give the detections of all cameras in the order of the cameras.",
-        )
     _require_metres(float(np.ptp(cameras.center, axis=0).max()), 0.0, 500.0, "cameras within")
     detections = _fill_frames(detections)
     rate = row_rate("reconstruct_bodies", fps, detections.frame)
@@ -137,15 +133,8 @@ def _require_rising(frame: Integers) -> None:
 
 def _fill_frames(detections: KeypointDetections) -> KeypointDetections:
     """Return the detections with the frames between others, in which nobody was seen."""
-    frame, index = detections.frame, detections.detection_index
+    frame = detections.frame
     if not len(frame):
-        return replace(detections, frame=np.arange(len(detections.score)))
+        return replace(detections, frame=detections.numbers)
     every = np.arange(frame[0], frame[-1] + 1, max(1, np.gcd.reduce(np.diff(frame))))
-    if len(every) == len(frame):
-        return detections
-    filled = detections.reindex(every)
-    if not len(index):
-        return filled
-    people = np.full((len(every), *index.shape[1:]), -1, dtype=index.dtype)
-    people[np.isin(every, frame)] = index
-    return filled.assign_people(people)
+    return detections if len(every) == len(frame) else detections.reindex(every)

@@ -118,8 +118,7 @@ class Clip:
     @cached_property
     def frame(self) -> Integers:
         """Match frame of each row (frames,)."""
-        frame, rows = self.detections.frame, len(self.detections.detection_index)
-        return frame if len(frame) else np.arange(rows)
+        return self.detections.numbers
 
     @cached_property
     def given(self) -> Flags:

@@ -133,6 +133,8 @@ def score_folders(
                 todo = "Write its poses, with NaN where the method found no person."
                 found = ", ".join(parts[name])
                 raise wrong(f"{folder}: clip {clip}", f"poses/{clip}.npz or joints", found, todo)
+            if camera is None and name == next(iter(predictions)):  # said once, not by each method
+                notes[name][f"{reference}/cameras"] = "absent for some clips: people without boxes"
             own = stated_rate(parts[name][clip], clip)
             require_one_rate({f"{part}": stated, f"{parts[name][clip]}": own})
             mine = _read_people(parts[name][clip], clip, body, match_in, truth)
@@ -141,6 +143,7 @@ def score_folders(
                 mine.tracks, truth.tracks, settings, fps=fps or stated, camera=camera, boxes=boxes
             )
             distances = matching.joint_distances(mine.tracks.joints, true)
+            _require_metres(mine, true, distances)
             match = matching.match_people(distances, settings.match_gate_m)
             sides = mine.tracks.joints, true
             tracks = matching.match_tracks(*sides, distances, match, camera, boxes, settings)
@@ -188,6 +191,8 @@ def _read_people(
     clips = list_clips(folder)
     shipped = read_clip(folder, clip, clips, find, None, 50.0)
     source = shipped.sources[0]
+    if truth is not None:
+        _require_same(str(folder), shipped)
     numbered = [each.frames for each in shipped.sources if each.frames is not None]
     first = truth.first if truth else int(numbered[0][0]) if numbered and len(numbered[0]) else 0
     rows = np.arange(len(source.points)) if source.frames is None else source.frames - first
@@ -236,6 +241,36 @@ def _read_people(
     tracks = metrics.drop_views(tracks, around[1] if around else None)
     camera = wanted[0] if wanted else None
     return _People(folder, where, tracks, first, shipped, camera, tuple(used), plural)
+
+
+def _require_metres(mine: _People, true: Floats, distances: Floats) -> None:
+    """Raise InputError if people are at the true places in another unit only."""
+
+    def nearest(each: Floats) -> float:
+        closest = each.min(axis=(1, 2), initial=np.inf)
+        known = closest[np.isfinite(closest)]
+        return float(np.median(known)) if len(known) else np.nan
+
+    for unit, size in (("millimetres", 1e-3), ("centimetres", 1e-2)):
+        scaled = nearest(matching.joint_distances(size * mine.tracks.joints, true))
+        # Bodies whose places alone have another unit become points at these places.
+        if scaled < min(1.0, 5.0 * size * nearest(distances)):
+            raise wrong(mine.where, "metres", unit, f"Multiply the places by {size:g}.")
+
+
+def _require_same(where: str, clip: ShippedClip) -> None:
+    """Raise InputError if poses and joints of the same people and frames are others."""
+    first, *others = clip.sources
+    for other in others:
+        if other.points.shape[:2] == first.points.shape[:2]:
+            shared = [name for name in COCO17 if name in {*first.skeleton} & {*other.skeleton}]
+            gaps = [first.point(name) - other.point(name) for name in shared]
+            gap = np.linalg.norm(gaps, axis=-1)
+            # Faces of bodies and of detectors differ by centimetres.
+            if np.isfinite(gap).any() and (apart := float(np.nanmedian(gap))) > 0.05:
+                expected = f"the people of {first.name}"
+                todo = "Keep the file that you mean, and remove the other one."
+                raise wrong(f"{where}/{other.name}", expected, f"{apart:.3g} m apart", todo)
 
 
 def _true_camera(truth: _People) -> Camera | None:

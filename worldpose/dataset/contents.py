@@ -177,6 +177,7 @@ def list_clips(folder: Path) -> tuple[str, ...]:
     if not names and (folder / "joints.npz").is_file():
         names = {only_clip}
     if not names:
+        parts = sorted({str(path.parents[1]) for path in folder.glob("*/poses/*.npz")})
         raise InputError(
             str(folder),
             expected="an exported data set: poses/<clip>.npz, joints.npz, <clip>.joints.npz or "
@@ -184,7 +185,9 @@ def list_clips(folder: Path) -> tuple[str, ...]:
             found=", ".join(sorted(path.name for path in folder.iterdir())[:8])
             if folder.is_dir()
             else "no such folder",
-            todo="Give the folder that worldpose export wrote, or one of the same layout.",
+            todo=f"Give a part of this data set: {', '.join(parts)}."
+            if parts
+            else "Give the folder that worldpose export wrote, or one of the same layout.",
         )
     return tuple(sorted(names))
 

@@ -341,6 +341,10 @@ def read_poses(path: Path) -> tuple[BodyParameters, str | None]:
         except InputError as error:
             errors.append(error)
             continue
+        for name, array in arrays.items():
+            if array.dtype.kind == "f" and np.isinf(array).any():
+                todo = "Correct what wrote the file."
+                raise wrong(f"{path}: {name}", "finite numbers, NaN where missing", "inf", todo)
         named = {renamed.get(name, name): array for name, array in arrays.items()}
         poses = BodyParameters(
             betas=named["betas"][:, None],

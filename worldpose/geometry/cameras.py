@@ -168,11 +168,15 @@ class Camera:
                 found=f"{k.tolist()}",
                 todo="Give K without skew, not transposed.",
             )
-        sizes = np.asarray(image_size, dtype=np.int64)
-        if np.any(np.diagonal(k[known], axis1=-2, axis2=-1) <= 0.0) or np.any(sizes <= 0):
+        if not isinstance(lens_model, LensModel):
+            named, todo = "Camera.from_matrices: lens_model", "Take LensModel.FISHEYE, for example."
+            raise InputError(named, "a LensModel", repr(lens_model), todo)
+        sizes = check_shape("Camera.from_matrices: image_size", image_size, (2,))
+        whole = (sizes > 0).all() and (sizes % 1.0 == 0.0).all()
+        if np.any(np.diagonal(k[known], axis1=-2, axis2=-1) <= 0.0) or not whole:
             raise InputError(
                 "Camera.from_matrices",
-                expected="positive focal lengths and image size",
+                expected="positive focal lengths and a positive, whole image size",
                 found=f"matrix {k.tolist()}, image_size {sizes.tolist()}",
                 todo="Give K in pixels, and width and height of the image.",
             )
@@ -188,7 +192,7 @@ class Camera:
             principal_point=k[..., :2, 2],
             distortion=_spread_coefficients("Camera.from_matrices", distortion, lens_model),
             cam_from_world=pose,
-            image_size=sizes,
+            image_size=sizes.astype(np.int64),
             lens_model=lens_model,
         )
 
@@ -459,7 +463,8 @@ def _normalize(cameras: Floats, points: Floats) -> tuple[Floats, Image]:
 
 def _spread_coefficients(where: str, given: ArrayLike, model: LensModel) -> Floats:
     """Return coefficients (..., 8) as `Camera` has them from a model's own in OpenCV's order."""
-    values = check_shape(f"{where}: distortion", given, (len(model.columns),))
+    name = f"{where}: distortion of lens_model {model.label}"
+    values = check_shape(name, given, (len(model.columns),))
     spread = np.zeros((*values.shape[:-1], _PARTS["distortion"]))
     spread[..., model.columns] = values
     return spread

@@ -42,6 +42,23 @@ def require_clip(
             found=f"{keypoints}, {confidence}, {views}{f', {index}' if tracked else ''}",
             todo="Give arrays of the same clip and cameras.",
         )
+    require_layout(where, detections, coco=not tracked)
+
+
+def require_layout(
+    where: str, detections: KeypointDetections[ClipArray], *, coco: bool = True
+) -> None:
+    """Require a frame number per row or none, and the points of COCO-17; InputError otherwise."""
+    keypoints, confidence = detections.keypoints.shape, detections.confidence.shape
+    frame = detections.frame
+    if coco and (confidence[-1] != 17 or keypoints != (*confidence, 2)):
+        expected = "COCO-17, keypoints (..., 17, 2) and confidence (..., 17)"
+        todo = "Select these points in this order; read_observations converts files of other sets."
+        raise InputError(where, expected, f"{keypoints} and {confidence}", todo)
+    if len(frame) and (frame.shape != confidence[:1] or frame.dtype.kind not in "iu"):
+        expected = f"{confidence[0]} whole numbers, one for each row, or none"
+        todo = "Give each row the number of its frame, not a time."
+        raise InputError(f"{where}: frame", expected, f"{frame.shape} {frame.dtype}", todo)
 
 
 @compile_kernel

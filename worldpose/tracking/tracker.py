@@ -116,8 +116,8 @@ def track_people(
         Constant velocity between frames departs from the paper (`predict_motion`).
     """
     cameras = Camera.batch(cameras)
-    fps = row_rate("tracking", fps, detections.frame)
     require_clip("tracking", cameras, detections)
+    fps = row_rate("tracking", fps, detections.frame)
     keypoints, confidence = detections.keypoints, detections.confidence
     tracker = FrameTracker(cameras, fps, pitch_size is not None, people, settings)
     frames = confidence.shape[0]

@@ -162,7 +162,7 @@ class Observations(NamedTuple):
         Arrays are contiguous and have one type: numba compiles a kernel again for every other.
         """
         return cls(
-            keypoints,
+            np.ascontiguousarray(keypoints),
             np.ascontiguousarray(precision),
             np.ascontiguousarray(index, dtype=np.int64),
             no_shift() if shift is None else shift,

@@ -23,6 +23,7 @@ from worldpose.body_fitting.standing import find_standing_distance
 from worldpose.errors import InputError
 from worldpose.geometry.rigid import Rigid
 from worldpose.simulation.detector_errors import MonocularErrors, estimate_bodies
+from worldpose.tracking.tracker import track_people
 from worldpose.triangulation.estimate import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
@@ -140,7 +141,9 @@ def test_every_second_frame_is_half_the_frame_rate():
 @pytest.mark.parametrize(
     ("cameras", "frame", "fps", "words"),
     [
-        (4, [0, 1, 2], 50.0, "detections of each of them"),
+        (4, [0, 1, 2], 50.0, "cameras .cameras,. of 2 or more"),
+        (3, [0, 1], 50.0, "found .2,. int64. Give each row the number"),
+        (3, [0.0, 0.5, 1.0], 50.0, "expected 3 whole numbers, one for each row, or none, found"),
         (3, [2, 1, 0], 50.0, "found numbers that repeat or fall"),
         (3, [0, 0, 1], 50.0, "found numbers that repeat or fall"),
         (3, [0, 40, 10**9], 50.0, "at most 200000 from first to last"),
@@ -155,8 +158,41 @@ def test_one_call_refuses_what_it_cannot_place(cameras, frame, fps, words):
 
 
 def test_one_call_refuses_no_detections():
-    with pytest.raises(InputError, match="detections of each of them"):
+    with pytest.raises(InputError, match="of 2 or more"):
         reconstruct_bodies(ring(3), [], 50.0)
+
+
+@pytest.mark.parametrize(("points", "sure"), [(25, 25), (13, 13), (17, 16)])
+def test_one_call_names_the_points_that_it_takes(points, sure):
+    seen = KeypointDetections.from_keypoints(
+        np.ones((2, 3, 1, points, 2)), np.ones((2, 3, 1, sure))
+    )
+    each = [replace(seen, keypoints=seen.keypoints[:, 0], confidence=seen.confidence[:, 0])] * 3
+    for call in (
+        lambda: reconstruct_bodies(ring(3), seen, 50.0),
+        lambda: reconstruct_bodies(ring(3), each, 50.0),
+        lambda: track_people(ring(3), seen, 50.0),
+    ):
+        with pytest.raises(InputError, match=r"17, 2|joints, 2"):
+            call()
+
+
+def test_rows_without_numbers_keep_their_place_and_people():
+    seen = KeypointDetections.from_keypoints(
+        np.ones((6, 3, 1, 17, 2)), np.ones((6, 3, 1, 17)), np.zeros((6, 3, 1), int)
+    )
+    part = seen[2:4]
+    assert part.frame.tolist() == [2, 3]
+    for each in (seen[:2], part):
+        found = each.reindex(np.arange(1, 4))
+        known = np.isin([1, 2, 3], each.frame)
+        np.testing.assert_array_equal(np.isfinite(found.keypoints).all((1, 2, 3, 4)), known)
+        np.testing.assert_array_equal((found.detection_index == 0).all((1, 2)), known)
+    fractions = KeypointDetections.from_keypoints(
+        seen.keypoints, seen.confidence, None, np.full(6, 0.5)
+    )
+    with pytest.raises(InputError, match="6 whole numbers"):
+        track_people(ring(3), fractions, 50.0)
 
 
 FPS, FRAMES = 25.0, 30

@@ -55,6 +55,28 @@ def test_the_rate_is_that_of_the_match_around_unless_the_folder_states_its_own(t
     assert stated_rates(tmp_path / "reference") == {"clip": 50.0}
 
 
+def test_a_side_in_millimetres_or_with_two_contents_or_infinite_is_refused(tmp_path):
+    frames, people, joints = np.arange(10), np.arange(2), standing(10, 2)
+    mine, true = tmp_path / "mine", tmp_path / "true"
+    write_joints(true / "A.joints.npz", JointTracks(frames, people, joints))
+    for unit, size in (("millimetres", 1e3), ("centimetres", 1e2)):
+        write_joints(mine / "A.joints.npz", JointTracks(frames, people, size * joints))
+        with pytest.raises(InputError, match=rf"mine/A\.joints\.npz.*metres, found {unit}"):
+            score_folders(true, {"mine": mine})
+    write_joints(mine / "A.joints.npz", JointTracks(frames, people, joints))
+    (found,), _ = score_folders(true, {"mine": mine})
+    assert found.notes[f"{true}/cameras"].startswith("absent")
+    place = joints.mean(axis=2).swapaxes(0, 1).copy()
+    poses = BodyParameters(np.zeros((2, 1, 10)), np.zeros((2, 10, 3)), np.zeros((2, 10, 69)), place)
+    write_poses(mine / "poses" / "A.npz", poses, OPEN_BODY)
+    with pytest.raises(InputError, match=r"A\.joints\.npz: expected the people of poses/A\.npz"):
+        score_folders(true, {"mine": mine})
+    place[0, 3] = np.inf
+    write_poses(mine / "poses" / "A.npz", poses, OPEN_BODY)
+    with pytest.raises(InputError, match=r"poses/A\.npz: transl: expected finite numbers"):
+        score_folders(true, {"mine": mine})
+
+
 def test_people_whom_one_camera_saw_count_by_no_door_unless_the_match_has_none(tmp_path):
     """The second of two people is 0.5 m off: she counts only where `views` are not of cameras."""
     joints, views = standing(10, 2), np.full((10, 2, 17), 3)
@@ -136,7 +158,7 @@ def test_short_clips_are_scored_and_late_ones_are_told(tmp_path, frames):
     folders = {name: tmp_path / name for name in ("same", "late")}
     (same, late), _ = score_folders(tmp_path / "true", folders)
     assert same.evaluation.g_mpjpe_mm == pytest.approx(0.0, abs=1e-6)
-    assert same.notes == {}
+    assert list(same.notes) == [f"{tmp_path}/true/cameras"]
     assert any("1 frames late" in note for note in late.notes.values()) == (frames > 1)
 
 
@@ -148,7 +170,7 @@ def test_a_short_clip_whose_last_frame_is_off_is_not_early_or_late(tmp_path):
         tracks = JointTracks(np.arange(3), np.arange(1), some)
         write_joints(tmp_path / name / "a.joints.npz", tracks)
     (scores,), _ = score_folders(tmp_path / "true", {"found": tmp_path / "found"})
-    assert scores.notes == {}
+    assert list(scores.notes) == [f"{tmp_path}/true/cameras"]
 
 
 def test_frames_between_the_labelled_ones_are_refused_by_folder(tmp_path):

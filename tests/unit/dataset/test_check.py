@@ -1,5 +1,6 @@
 """Every broken convention of cameras and poses is named, and a sound data set is left alone."""
 
+import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -177,8 +178,11 @@ def test_a_gap_of_the_moving_camera_is_no_slip_and_another_rate_is_said(
     assert "A_1.json: not compared" in told.notes[1]
 
 
-def test_a_folder_without_data_is_refused(tmp_path):
+def test_a_folder_without_data_is_refused(tmp_path, written):
     with pytest.raises(InputError, match="an exported data set"):
+        list_clips(tmp_path)
+    shutil.copytree(written / "plain", tmp_path / "train")
+    with pytest.raises(InputError, match=f"Give a part of this data set: {tmp_path}/train"):
         list_clips(tmp_path)
 
 

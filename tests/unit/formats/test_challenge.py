@@ -22,7 +22,7 @@ from worldpose.formats.challenge import (
     write_challenge_camera,
     write_submission,
 )
-from worldpose.formats.release_cameras import read_camera_rows
+from worldpose.formats.release_cameras import read_camera_rows, read_kit_camera
 from worldpose.geometry.rigid import Rigid
 
 FRAMES = 3
@@ -114,6 +114,24 @@ def test_a_camera_file_has_the_pose_of_the_first_frame_alone(camera, tmp_path, e
     assert np.isnan(rows.rotation[1:]).all()
     points = np.zeros((1, 3))
     np.testing.assert_allclose(rows.camera().project(points)[0], camera.project(points)[0])
+
+
+def test_a_lens_with_k3_becomes_one_of_the_kit(camera, tmp_path):
+    path, lens = tmp_path / "A_1.npz", camera.distortion.copy()
+    lens[:, 4] = 30.0  # 14 px in the corner
+    bent = replace(camera, distortion=lens)
+    error = write_challenge_camera(path, bent, 2026)
+    size = tuple(camera.image_size.reshape(-1, 2)[0].tolist())
+    kit = read_kit_camera(path, size)
+    assert not kit.distortion[:, 2:].any()
+    rays = bent[0].normalize(bent[0].image_grid())
+    pose = bent[0].cam_from_world
+    points = (np.column_stack([rays, np.ones(len(rays))]) - pose.translation) @ pose.rotation
+    shift = kit[0].project(points) - bent[0].project(points)
+    assert 0.0 < np.linalg.norm(shift, axis=-1).max() <= 1.01 * error
+    plain = replace(kit, distortion=camera.distortion)
+    without = plain[0].project(points) - bent[0].project(points)
+    assert np.linalg.norm(without, axis=-1).max() > 10.0 * error
 
 
 @pytest.mark.parametrize(

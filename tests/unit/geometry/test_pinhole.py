@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.lens_models import fold_radius
+from worldpose.geometry.lens_models import LensModel, fold_radius
 from worldpose.geometry.rays import Rays, RayStatus, intersect_rays
 from worldpose.geometry.rigid import Rigid
 
@@ -362,3 +362,17 @@ def test_large_world_coordinates_keep_their_digits():
     # As ten metres apart without the shift; solving in grid coordinates would lose 1e-5 m.
     np.testing.assert_allclose(intersect_rays(rays_through(origins, target))[0], target, rtol=0.0,
                                atol=1e-8)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("lens", "size", "model", "words"),
+    [
+        (5, None, LensModel.BROWN, "image_size: expected shape"),
+        (5, (1920.5, 1080), LensModel.BROWN, "a positive, whole image size"),
+        (5, (1920, 1080), "fisheye", "expected a LensModel, found 'fisheye'"),
+        (8, (1920, 1080), LensModel.BROWN, "distortion of lens_model brown: expected shape"),
+    ],
+)
+def test_sizes_and_lens_models_that_no_camera_has_are_refused(lens, size, model, words):
+    with pytest.raises(InputError, match=words):
+        Camera.from_matrices(np.eye(3), np.zeros(lens), np.eye(3), np.zeros(3), size, model)

@@ -99,6 +99,16 @@ def test_joints_are_bit_for_bit_those_without_points(clip):
     np.testing.assert_array_equal(one.smoothing.joints, two.smoothing.joints)
 
 
+def test_arrays_of_any_order_in_memory_go_to_the_kernels_in_rows(clip):
+    _, _, seen, _ = clip
+    given = np.asfortranarray(seen.keypoints), np.asfortranarray(seen.confidence)
+    found = as_detections(*given)
+    assert found.keypoints.flags.c_contiguous and found.confidence.flags.c_contiguous
+    observed = Observations.of(clip[0], given[0], given[1], seen.detection_index)
+    assert observed.keypoints.flags.c_contiguous
+    np.testing.assert_array_equal(observed.keypoints, seen.keypoints)
+
+
 def test_points_are_found_within_their_noise(clip):
     cameras, _, with_feet, truth = clip
     found = triangulate_joints(cameras, with_feet, replace_settings(offsets="none")).extra
