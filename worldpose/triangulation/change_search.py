@@ -70,13 +70,16 @@ def follow_changes(
             before, camera = changes[-1], names.index(changes[-1].camera)
             after = refine_change(cameras, people, fps, camera, before)
             # Just before and after it, people show nothing of a change that is no sudden one.
-            is_gone = math.hypot(*after.shift_px) < 0.25 * math.hypot(*before.shift_px)
+            shift = math.hypot(*after.shift_px)
+            is_gone = shift < 0.25 * math.hypot(*before.shift_px)
             if is_gone and before.frame is not None:
                 changes[-1] = _slow_change(before)
                 detections = open_detections(changes)
                 continue
             changes[-1] = after
-            if is_gone or is_by_chance(after):
+            # The few people of a short rest of the clip may meet others anywhere.
+            is_vague = after.std is not None and shift < 3.0 * after.std
+            if is_gone or is_vague or is_by_chance(after):
                 detections = open_detections(changes[:-1])
                 return FollowedClip(detections, track(detections), tuple(changes[:-1]))
             detections = open_detections(changes)
@@ -130,4 +133,12 @@ def add_changes(
             new.append(change)
         elif change.frame is None:  # the tracker measured the drift on the people that it had left
             stay[stay.index(same[0])] = join_changes(cameras[each.camera], same[0], change)
+    clocks = {each.camera: each.frame for each in new if each.kind == "clock" and each.frame}
+    stay = [  # the tracker measures a step coarsely
+        each
+        for each in stay
+        if each.kind == "view"
+        or each.frame is None
+        or abs(clocks.get(each.camera, np.inf) - each.frame) > fps
+    ]
     return [each for each in stay if not explains_clock(new, each)], new

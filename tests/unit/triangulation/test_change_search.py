@@ -26,6 +26,7 @@ GONE = KNOCK.model_copy(update={"shift_px": (9.0, 1.0)})
 SUNK = KNOCK.model_copy(update={"frame": None, "shift_px": (80.0 / 1.5, 0.0)})
 SUNK_MORE = SUNK.model_copy(update={"shift_px": (58.0, 2.0)})
 SUNK_LITTLE = SUNK.model_copy(update={"shift_px": (13.0, 0.0)})
+VAGUE = TURNED.model_copy(update={"std": 20.0})
 ZOOMED = KNOCK.model_copy(update={"zoom": 0.2})
 
 
@@ -36,8 +37,9 @@ ZOOMED = KNOCK.model_copy(update={"zoom": 0.2})
         ([GONE, SUNK_MORE], (SUNK_MORE,)),
         ([GONE, SUNK_LITTLE], ()),
         ([ZOOMED], ()),
+        ([VAGUE], ()),
     ],
-    ids=["knocked", "sunk", "sunk little", "by chance"],
+    ids=["knocked", "sunk", "sunk little", "by chance", "vague"],
 )
 def test_what_the_people_show_again_of_a_lost_view_decides(monkeypatch, refined, kept):
     opened, left = list[tuple[CameraChange, ...]](), list(refined)
@@ -72,3 +74,13 @@ def test_what_the_people_show_again_of_a_lost_view_decides(monkeypatch, refined,
         assert opened[2] == (SUNK,)
     if kept:  # a clock is told alone
         assert [each.camera for each in found.changes if each.kind == "clock"] == ["a"]
+
+
+def test_a_step_of_a_clock_that_joints_measure_again_is_told_once():
+    told = KNOCK.model_copy(update={"kind": "clock", "shift_px": (0.0, 0.0), "late_frames": 6.0})
+    other = told.model_copy(update={"camera": "a"})
+    measured = MeasuredChange(1, "clock", 21, np.array([0.0, 0.0, 0.0, 0.0, 8.9]))
+    frame = np.arange(FIRST, FIRST + 41)
+    found = change_search.add_changes([told, other], [measured], ("a", "b", "c"), None, frame, 25.0)
+    assert found[0] == [other]
+    assert [(each.frame, each.late_frames) for each in found[1]] == [(FIRST + 21, 8.9)]
