@@ -90,7 +90,8 @@ class KeypointDetections(Generic[Array]):
         shape = confidence.shape[:-1]
         nan = np.array(np.nan, dtype=confidence.dtype)
         number = np.asarray(() if frame is None else frame)
-        whole = number.astype(np.int64)  # others stay, for the functions that take them to refuse
+        with np.errstate(invalid="ignore"):
+            whole = number.astype(np.int64)  # others stay: the functions that take them refuse
         return KeypointDetections(
             keypoints,
             confidence,
@@ -161,9 +162,13 @@ class KeypointDetections(Generic[Array]):
         return self.frame if len(self.frame) or len(shape) < 2 else np.arange(shape[0])
 
     def __getitem__(self, frames: slice | Integers) -> KeypointDetections:
-        """Return the detections of some rows of the frame dimension, in memory."""
+        """Return the detections of some rows of the frame dimension, in memory.
+
+        A part of neighbouring rows keeps their numbers. Others have numbers if these are given.
+        """
         arrays: dict[str, Any] = {name: array[frames] for name, array in self.arrays().items()}
-        numbers = self.numbers
+        is_part = isinstance(frames, slice) and frames.step in (None, 1)
+        numbers = self.numbers if is_part else self.frame
         return KeypointDetections(
             **arrays,
             frame=numbers[frames] if len(numbers) else numbers,

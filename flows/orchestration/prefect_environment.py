@@ -334,12 +334,15 @@ def problem_at(address: str, certificate: str | None = None) -> str:
     """
     is_here = urlsplit(address).hostname in LOOPBACK_NAMES
     handlers: list[urllib.request.BaseHandler] = [urllib.request.ProxyHandler({})] * is_here
-    try:
-        if certificate is not None:
+    if certificate is not None:
+        try:
             trust = ssl.create_default_context(cafile=certificate)
-            trust.check_hostname = False
-            trust.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
-            handlers.append(urllib.request.HTTPSHandler(context=trust))
+        except OSError as error:
+            return f"its certificate {certificate} cannot be read: {error}"
+        trust.check_hostname = False
+        trust.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
+        handlers.append(urllib.request.HTTPSHandler(context=trust))
+    try:
         opener = urllib.request.build_opener(*handlers)
         with opener.open(address, timeout=5) as answer:
             return "" if answer.status == 200 else f"{address} answers {answer.status}"

@@ -12,6 +12,7 @@ from prefect import Flow
 from prefect.utilities.callables import parameter_schema
 
 from flows.orchestration.prefect_api import PrefectApi
+from flows.service.health import of_other_project
 from flows.service.layout import PRIORITIES
 from flows.service.match_runs import MatchRuns
 from flows.service.plan import Schedule, ServePlan, deployment_name
@@ -84,8 +85,13 @@ def install(plan: ServePlan) -> dict[str, Installed]:
 
     Returns:
         Flows that a worker can run, by deployment id.
+
+    Raises:
+        InputError: another project has deployments of this name at the server.
     """
     prefect = MatchRuns.of_plan(plan)
+    if (refusal := of_other_project(prefect, plan, plan.state_folder)) is not None:
+        raise refusal
     matches, arrivals = pools(plan)
     for pool, limit, about in (
         (matches, plan.max_concurrent, "Matches, urgent ones first"),

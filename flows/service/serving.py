@@ -85,6 +85,7 @@ class _Supervisor:
     secrets: Secrets
     tell: Tell
     parts: list[_Part] = field(default_factory=list)
+    started_at: datetime = field(default_factory=lambda: datetime.now(UTC))
 
     def start(self, name: str, address: str | None = None) -> _Part:
         part = _Part(name, address, self.plan.state_folder.logs / f"{name}.log")
@@ -125,7 +126,7 @@ class _Supervisor:
             owns_prefect=plan.owns_prefect,
             certificate=None if plan.certificate is None else str(plan.certificate.resolve()),
             services={**services, "serve": Service(pid=os.getpid())},
-            started_at=datetime.now(UTC),
+            started_at=self.started_at,
         )
         plan.state_folder.write_serving(serving)
         return serving

@@ -191,8 +191,6 @@ def _read_people(
     clips = list_clips(folder)
     shipped = read_clip(folder, clip, clips, find, None, 50.0)
     source = shipped.sources[0]
-    if truth is not None:
-        _require_same(str(folder), shipped)
     numbered = [each.frames for each in shipped.sources if each.frames is not None]
     first = truth.first if truth else int(numbered[0][0]) if numbered and len(numbered[0]) else 0
     rows = np.arange(len(source.points)) if source.frames is None else source.frames - first
@@ -253,24 +251,9 @@ def _require_metres(mine: _People, true: Floats, distances: Floats) -> None:
 
     for unit, size in (("millimetres", 1e-3), ("centimetres", 1e-2)):
         scaled = nearest(matching.joint_distances(size * mine.tracks.joints, true))
-        # Bodies whose places alone have another unit become points at these places.
-        if scaled < min(1.0, 5.0 * size * nearest(distances)):
+        # No pitch has people so far from each other [m].
+        if scaled < 5.0 and nearest(distances) > 150.0:
             raise wrong(mine.where, "metres", unit, f"Multiply the places by {size:g}.")
-
-
-def _require_same(where: str, clip: ShippedClip) -> None:
-    """Raise InputError if poses and joints of the same people and frames are others."""
-    first, *others = clip.sources
-    for other in others:
-        if other.points.shape[:2] == first.points.shape[:2]:
-            shared = [name for name in COCO17 if name in {*first.skeleton} & {*other.skeleton}]
-            gaps = [first.point(name) - other.point(name) for name in shared]
-            gap = np.linalg.norm(gaps, axis=-1)
-            # Faces of bodies and of detectors differ by centimetres.
-            if np.isfinite(gap).any() and (apart := float(np.nanmedian(gap))) > 0.05:
-                expected = f"the people of {first.name}"
-                todo = "Keep the file that you mean, and remove the other one."
-                raise wrong(f"{where}/{other.name}", expected, f"{apart:.3g} m apart", todo)
 
 
 def _true_camera(truth: _People) -> Camera | None:

@@ -121,11 +121,11 @@ KINDS: Final = {"boxes": (4,), "skel_2d": ("points", 2), "skel_3d": ("points", 3
 def write_challenge_camera(path: Path, camera: Camera, edition: Edition) -> float:
     """Write cameras/<clip>.npz: every frame's K and k, and R and t of the first frame alone.
 
-    The kit's lenses have k1 and k2 alone. Where k3 is not zero, k1 and k2 are those of the least
-    squared error over the image's circle. The edition of 2025 repeats R and t as Rt.
+    The kit's lenses have k1 and k2 alone: with others, those are the best over the image's pixels.
+    The edition of 2025 repeats R and t as Rt.
 
     Returns:
-        Greatest error of the lens in the circle [px].
+        Greatest error of the lens in the image [px].
 
     Raises:
         InputError: the first frame has no camera.
@@ -138,20 +138,23 @@ def write_challenge_camera(path: Path, camera: Camera, edition: Edition) -> floa
             "Calibrate the first frame, or export another format.",
         )
     arrays = camera_arrays(camera)
-    arrays["k"] = arrays["k"].copy()
-    k3, focal = arrays["k"][:, 4].copy(), camera.focal.mean(axis=-1)
-    radius = np.hypot(*np.moveaxis(camera.image_size / 2.0, -1, 0)) / focal
-    # Of a s^3 + b s^5, nearest to s^7 in the unit circle; the error is greatest at its edge.
-    a, b = -10.0 / 21.0, 10.0 / 7.0
-    arrays["k"][:, 0] += a * radius**4 * k3
-    arrays["k"][:, 1] += b * radius**2 * k3
-    arrays["k"][:, 4] = 0.0 * k3  # missing frames stay NaN
-    error = np.abs((1.0 - a - b) * k3 * radius**7 * focal)
+    arrays["k"], worst = arrays["k"].copy(), 0.0
+    for frame in np.flatnonzero(arrays["k"][:, 2:].any(axis=1) & np.isfinite(camera.focal[:, 0])):
+        one = camera[int(frame)]
+        rays = one.normalize(pixels := one.image_grid())
+        radius = (rays**2).sum(axis=-1)
+        known = np.isfinite(radius)  # a lens may fold in the corners
+        off = ((pixels - one.principal_point) / one.focal - rays)[known]
+        columns = np.stack([rays * radius[:, None] ** power for power in (1, 2)], axis=-1)[known]
+        k, *_ = np.linalg.lstsq(columns.reshape(-1, 2), off.reshape(-1), rcond=None)
+        arrays["k"][frame] = [*k, 0.0, 0.0, 0.0]
+        rest = (columns @ k - off) * one.focal
+        worst = max(worst, float(np.linalg.norm(rest, axis=-1).max()))
     arrays["R"], arrays["t"] = arrays["R"][:1], arrays["t"][:1]
     if edition == 2025:
         arrays["Rt"] = np.concatenate([arrays["R"], arrays["t"][..., None]], axis=-1)
     write_archive(path, arrays)
-    return float(np.nanmax(error))
+    return worst
 
 
 def write_challenge(

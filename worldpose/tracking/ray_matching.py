@@ -50,7 +50,7 @@ def require_layout(
 ) -> None:
     """Require a frame number per row or none, and the points of COCO-17; InputError otherwise."""
     keypoints, confidence = detections.keypoints.shape, detections.confidence.shape
-    frame = detections.frame
+    frame = np.asarray(detections.frame)
     if coco and (confidence[-1] != 17 or keypoints != (*confidence, 2)):
         expected = "COCO-17, keypoints (..., 17, 2) and confidence (..., 17)"
         todo = "Select these points in this order; read_observations converts files of other sets."
