@@ -252,9 +252,9 @@ class Comparison:
             frames += 1
         return frames >= 3 and same >= 0.7 * people
 
-    def people(self, among: Sequence[int], views: int = 2) -> list[Floats]:
-        """Return the people (persons, 17, 3) [m] that cameras agree on, frame by frame."""
-        found, settings = [], TrackingSettings(birth_views=views)
+    def people(self, among: Sequence[int]) -> list[Floats]:
+        """Return the people (persons, 17, 3) [m] whom three cameras or all see, frame by frame."""
+        found, settings = [], TrackingSettings(birth_views=min(3, len(among)))
         most = max(self.views[c].rays.shape[1] for c in among)
         centers = np.stack([self.views[c].center for c in among])
         focal = self.cameras.focal.mean(axis=-1)

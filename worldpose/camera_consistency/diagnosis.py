@@ -273,9 +273,9 @@ class Diagnosis:
 
     def record_unexplained(self, c: int, core: Sequence[int]) -> None:
         """Record a camera that misses people seen by the others, without a known cause."""
-        if self.has_partner(c):
+        if self.has_partner(c) or len(core) < 3:
             return
-        people = self.comparison.people(core, views=3)
+        people = self.comparison.people(core)
         share, found, expected = self.comparison.shares(c, STATED, people)
         seen = np.isfinite(self.comparison.views[c].rays[..., 0]).any(axis=-1).sum()
         enough = len(self.comparison.sample)

@@ -106,7 +106,8 @@ def read_lenses(
     try:
         matrix, distortion = matrix.astype(np.float64), distortion.astype(np.float64)
         matrix = matrix.reshape(3, 3) if matrix.size == 9 else matrix
-        if isinstance(roi, Mapping) and "x_offset" in roi and _image_size(roi):
+        is_whole = own == tuple(sizes[camera])
+        if isinstance(roi, Mapping) and "x_offset" in roi and _image_size(roi) and not is_whole:
             own = _image_size(roi)  # of ROS: the images show this part of the sensor
             matrix[:2, 2] -= [roi["x_offset"], roi["y_offset"]]
     except (ValueError, TypeError, LookupError) as error:

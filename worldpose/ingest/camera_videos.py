@@ -91,7 +91,9 @@ def _films_in(folder: Path) -> list[Path]:
     """Return the videos of a folder by their endings; if none has one, by their content."""
     most = 200  # files whose content is looked at: cameras are fewer
     files = [file for file in sorted(folder.glob("[!.]*")) if not file.is_dir()]
-    named = [*filter(is_video, files)]  # with links to a disk that is away, which is told later
+    # With links to a disk that is away, which is told later; without a DVD's menus.
+    menu = re.compile(r"VTS_\d\d_0\.VOB|VIDEO_TS\.VOB", re.IGNORECASE)
+    named = [file for file in files if is_video(file) and not menu.fullmatch(file.name)]
     if named or len(files) > most:
         return named
     return [file for file in files if file.is_file() and holds_video(file)]
@@ -144,7 +146,7 @@ def _recordings(files: Sequence[Path]) -> list[list[Path]]:
 def _chapter(file: Path) -> tuple[str, str, str, int] | None:
     """Return what names a chapter's recording, and the chapter's number; None for other videos."""
     chapter = _CHAPTER.fullmatch(file.stem)
-    if chapter is None:
+    if chapter is None or (chapter[5] is not None) != (file.suffix.lower() == ".vob"):
         return None
     before, kind, number, recording, title, title_number, part = chapter.groups()
     kind = (kind or title or "GP").upper()  # GOPR0017 begins what GP010017 continues

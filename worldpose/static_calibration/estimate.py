@@ -127,10 +127,9 @@ def _choose_side(found: Explanation, pitch: PitchTemplate, place: Floats | None)
     """Return the camera, or itself after half a turn, on the side of a place (3,) [m]."""
     camera = found.estimate.camera
     if place is not None:
-        here = camera.center[:2]
-        near, far = (float(np.linalg.norm(way * here - place[:2])) for way in (1.0, -1.0))
-        if abs(near - far) > 0.25 * np.linalg.norm(here):  # else it lies between the two
-            return turn_camera(camera) if far < near else camera
+        along = float(camera.center[:2] @ place[:2] / np.linalg.norm(place[:2]))
+        if abs(along) > 0.05 * np.linalg.norm(camera.center[:2]):  # else it lies between the two
+            return turn_camera(camera) if along < 0.0 else camera
     names = [name for name in pitch.points if turn_name(name) != name]
     names.sort(key=lambda name: float(np.linalg.norm(pitch.points[name])))
     raise InputError(

@@ -192,8 +192,9 @@ def _alternatives(
         points = np.ones(len(evidence.points), dtype=np.bool_)
         alone = problem.select(points, np.zeros(len(evidence.markings), dtype=np.bool_))
         yield alone, lambda fit: f"{names} left out: drawn elsewhere than the points say"
-    # Fewer points or markings do not distinguish a crop from wrong names.
-    if max(len(evidence.points), len(evidence.markings)) >= 7:
+    # Fewer points or markings do not distinguish a crop from wrong names, nor do markings alone
+    # distinguish it from a lens whose axis is oblique.
+    if max(len(evidence.points), len(evidence.markings) if suspicious else 0) >= 7:
         yield replace(problem, prior=prior), shift
 
 

@@ -316,10 +316,11 @@ def _read_coco(content: bytes) -> Iterator[MarkedImage]:
     if isinstance(given, dict) and "data" in given and "images" not in given:
         yield from _read_label_studio(json.dumps([given]).encode())
         return
-    if "shapes" in given:
-        yield _read_labelme(given)
-        return
-    _require_known(given)
+    if isinstance(given, dict) and "images" not in given:
+        if "shapes" in given:
+            yield _read_labelme(given)
+            return
+        _require_known(given)
     if isinstance(given, dict) and isinstance(given.get("annotations"), list):
         marked = [each for each in given["annotations"] if isinstance(each, dict)]
         if any(isinstance(each.get("lines"), dict) for each in marked):
