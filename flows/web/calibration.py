@@ -155,7 +155,7 @@ def routes(context: PageContext) -> APIRouter:
         match_id: str, owner: str, clicked: Clicked, frame: int | None = None
     ) -> JSONResponse:
         match, drawing, size = open_picture(match_id, owner)
-        markings = clicked.markings()
+        markings, spec = clicked.markings(), match.folder.spec.filming_camera(owner)
         try:
             found = preview(
                 drawing,
@@ -164,6 +164,7 @@ def routes(context: PageContext) -> APIRouter:
                 picture=pictures.decode_image(match, owner, frame) if clicked.refine else None,
                 settings=StaticCalibrationSettings() if clicked.refine else _POINTS_ALONE,
                 lens=match.folder.lenses.get(owner),
+                side=None if spec is None else spec.side,
             )
         except InputError as error:
             advice = {"camera": None, "expected": error.expected, "todo": error.todo}

@@ -12,6 +12,7 @@ import yaml
 from camera_builders import look_at_camera
 from prefect.states import Failed
 
+from data_contracts.static_calibration import ClickedMarkings
 from flows.match import task_of
 from flows.method import METHOD
 from flows.registering import register
@@ -26,6 +27,7 @@ from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.ingest.importing import import_lenses
 from worldpose.ingest.match_folder import read_match
 from worldpose.pitch.template import PitchTemplate
+from worldpose.review.evidence import PitchDrawing, preview
 from worldpose.store.recipes import recipe_differences
 from worldpose.store.store import Store
 
@@ -163,6 +165,12 @@ def test_a_stated_side_decides_clicks_that_both_sides_see_alike(clicked):
         stored = store.open_result(match.match_id, "static_calibration", "cam00", unit.key)
         center = camera_from_arrays(stored.data_vars).center if stored.data_vars else np.zeros(3)
         found[side] = np.sign(np.ravel(center)[1])
+        if side:  # the page shows what the run takes
+            pitch, given = PitchDrawing(PitchTemplate.standard()), ClickedMarkings(drawn=drawn)
+            assert (
+                np.sign(preview(pitch, given, (1920, 1080), side=side).camera.center[1])
+                == (found[side])
+            )
     assert found == {None: 0.0, "near": -1.0, "far": 1.0}
 
 

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from data_contracts.arrays import Floats, find_runs
 from data_contracts.cameras import LensCalibration
+from data_contracts.match import Side
 from data_contracts.review import Acceptance
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.geometry.cameras import Camera
@@ -25,6 +26,7 @@ from worldpose.review.detections import DetectionEdit
 from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.report import CalibrationReport
 from worldpose.static_calibration.settings import StaticCalibrationSettings
+from worldpose.static_calibration.sides import place_at
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,6 +333,7 @@ def preview(
     picture: NDArray[np.uint8] | None = None,
     settings: StaticCalibrationSettings = StaticCalibrationSettings(),  # noqa: B008
     lens: LensCalibration | None = None,
+    side: Side | None = None,
 ) -> Preview:
     """Return the camera from the current clicks, and the projected pitch.
 
@@ -348,6 +351,7 @@ def preview(
         settings=settings,
         where="so far",
         lens=lens,
+        start=side and place_at(side),
     )
     camera = found.estimate.camera
     return Preview(
