@@ -88,7 +88,7 @@ def count_changes(options: Namespace) -> Tables:
 
 
 def draw_film(options: Namespace, seed: int, rng: np.random.Generator) -> Film | None:
-    """Return a clip of either world."""
+    """Return a clip of either world, by cameras with the errors of a good calibration."""
     cameras, seconds = int(rng.integers(4, 13)), options.duration
     if options.world == "second":
         rates = {"rates": (options.fps,)} if options.fps else {}

@@ -167,18 +167,20 @@ def fit_cameras(
         information=np.empty((count, STEP, STEP)),
         evidence_information=np.empty((count, STEP, STEP)),
     )
-    clicked = evidence.points_world, evidence.points_image
-    drawn = evidence.samples_world, evidence.bounds, evidence.drawn_image, evidence.drawn_marking
     given = Measurements(
-        *clicked,
-        *drawn,
-        problem.prior,
-        problem.free,
-        problem.click_noise,
-        problem.drawn_noise,
-        problem.half_diagonal,
-        float(click_loss),
-        float(problem.drawn_loss),
+        points_world=evidence.points_world,
+        points_image=evidence.points_image,
+        samples_world=evidence.samples_world,
+        bounds=evidence.bounds,
+        drawn_image=evidence.drawn_image,
+        drawn_marking=evidence.drawn_marking,
+        prior=problem.prior,
+        free=problem.free,
+        click_noise=problem.click_noise,
+        drawn_noise=problem.drawn_noise,
+        half_diagonal=problem.half_diagonal,
+        click_loss=float(click_loss),
+        drawn_loss=float(problem.drawn_loss),
     )
     _descend(given, iterations, found)
     return found

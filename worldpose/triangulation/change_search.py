@@ -133,12 +133,14 @@ def add_changes(
             new.append(change)
         elif change.frame is None:  # the tracker measured the drift on the people that it had left
             stay[stay.index(same[0])] = join_changes(cameras[each.camera], same[0], change)
-    clocks = {each.camera: each.frame for each in new if each.kind == "clock" and each.frame}
-    stay = [  # the tracker measures a step coarsely
-        each
-        for each in stay
-        if each.kind == "view"
-        or each.frame is None
-        or abs(clocks.get(each.camera, np.inf) - each.frame) > fps
-    ]
+    steps = [each for each in new if each.kind == "clock" and each.frame is not None]
+    stay = [one for one in stay if not any(_is_measured_again(one, each, fps) for each in steps)]
     return [each for each in stay if not explains_clock(new, each)], new
+
+
+def _is_measured_again(known: CameraChange, step: CameraChange, fps: float) -> bool:
+    """Return whether a step of a clock is one that the tracker measured, coarsely."""
+    is_same = (known.camera, known.kind) == (step.camera, step.kind)
+    if not is_same or known.frame is None or step.frame is None:
+        return False
+    return abs(known.frame - step.frame) <= fps

@@ -79,8 +79,16 @@ def test_what_the_people_show_again_of_a_lost_view_decides(monkeypatch, refined,
 def test_a_step_of_a_clock_that_joints_measure_again_is_told_once():
     told = KNOCK.model_copy(update={"kind": "clock", "shift_px": (0.0, 0.0), "late_frames": 6.0})
     other = told.model_copy(update={"camera": "a"})
-    measured = MeasuredChange(1, "clock", 21, np.array([0.0, 0.0, 0.0, 0.0, 8.9]))
+    measured, far = (
+        MeasuredChange(1, "clock", row, np.array([0.0, 0.0, 0.0, 0.0, late]))
+        for row, late in ((21, 8.9), (35, 2.0))
+    )
     frame = np.arange(FIRST, FIRST + 41)
-    found = change_search.add_changes([told, other], [measured], ("a", "b", "c"), None, frame, 25.0)
+    found = change_search.add_changes(
+        [told, other], [measured, far], ("a", "b", "c"), None, frame, 10.0
+    )
     assert found[0] == [other]
-    assert [(each.frame, each.late_frames) for each in found[1]] == [(FIRST + 21, 8.9)]
+    assert [(each.frame, each.late_frames) for each in found[1]] == [
+        (FIRST + 21, 8.9),
+        (FIRST + 35, 2.0),
+    ]
