@@ -78,6 +78,7 @@ def find_changes(
     rows: Integers,
     sums: ChangeSums,
     kinds: Sequence[Kind] = ("clock", "view"),
+    start: Sequence[Part] = (),
 ) -> list[MeasuredChange]:
     """Return the changes of all cameras within a clip.
 
@@ -88,13 +89,14 @@ def find_changes(
         rows: the rows of the clip that `sums` count, evenly apart.
         sums: equations of the people as triangulated.
         kinds: what may change.
+        start: parts that the sums have taken back.
     """
     frames, free = len(rows), None
-    parts, after = _fit_clip(cameras, people, fps, rows, sums, kinds)
+    parts, after = _fit_clip(cameras, people, fps, rows, sums, kinds, start)
     swaying = find_sway(sums, after, parts) if "view" in kinds else None
     if swaying is not None:
         free, is_left_out = swaying
-        parts, after = _fit_clip(cameras, people, fps, rows, sums, kinds, free)
+        parts, after = _fit_clip(cameras, people, fps, rows, sums, kinds, start, free)
     shifting = [part for part in parts if part.shape != "constant"]
     stds = spreads(after, shifting, frames)
     # Where rows are sampled, all frames between two tell at which a view steps.
@@ -122,13 +124,14 @@ def _fit_clip(
     rows: Integers,
     sums: ChangeSums,
     kinds: Sequence[Kind],
+    start: Sequence[Part],
     free: int | None = None,
 ) -> tuple[list[Part], ChangeSums]:
     """Return parts as of `find_changes`, and sums with them taken back.
 
     The views of a `free` camera count for nothing.
     """
-    parts = [Part(c, "constant", 0, (0.0,)) for c in range(sums.cameras)]
+    parts = [*(Part(c, "constant", 0, (0.0,)) for c in range(sums.cameras)), *start]
     tried = [[part.name for part in parts]]
     for _ in range(12):
         sums = sums if free is None else sums.without_camera(free)
@@ -374,19 +377,6 @@ def is_same_change(one: CameraChange, other: CameraChange, fps: float) -> bool:
     else:
         near = abs(one.frame - other.frame) <= fps
     return same and near and other.is_explained
-
-
-def explains_clock(found: Sequence[CameraChange], known: CameraChange) -> bool:
-    """Return whether changes of a camera's clock show how late it is after a known step.
-
-    The tracker tells a step wherever people cease to meet; a drift may be the reason.
-    """
-    last = known.first_frame + known.frame_count
-    frame = np.arange(known.first_frame if known.frame is None else known.frame, last)
-    own = [each for each in found if each.kind == "clock" and each.camera == known.camera]
-    late = sum(each.late_frames * float(_shares(each, frame).mean()) for each in own)
-    near = abs(late - known.late_frames) <= max(1.0, 0.25 * abs(known.late_frames))
-    return known.kind == "clock" and bool(own) and near
 
 
 def is_by_chance(change: CameraChange) -> bool:

@@ -1,17 +1,19 @@
 """The search for changes of cameras within a clip: far ones while people are tracked, then all.
 
-A far knock is taken back before people are tracked again. Their joints then show smaller changes.
+A far knock is taken back before people are tracked again. So are clocks, until they stay: a tracker
+that follows people by a wrong clock loses those who run. Joints then show smaller changes.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from data_contracts.arrays import ClipArray, Integers
+from data_contracts.arrays import ClipArray, Integers, Singles
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import CameraChange
 from worldpose.geometry.cameras import Camera
@@ -19,13 +21,17 @@ from worldpose.tracking.tracker import Tracking
 from worldpose.triangulation.camera_changes import (
     MeasuredChange,
     change_record,
-    explains_clock,
+    find_changes,
     is_by_chance,
     is_same_change,
     join_changes,
     refine_change,
+    sum_clip,
 )
+from worldpose.triangulation.change_parts import Part
+from worldpose.triangulation.change_sums import LOOSE
 from worldpose.triangulation.lost_views import find_lost_views
+from worldpose.triangulation.settings import TriangulationSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,10 +97,109 @@ def follow_changes(
             if each.kind == "view" and not any(is_same_change(one, each, fps) for one in changes)
         ]
         if not views or len(changes) >= 2 * len(names):
-            clocks = [each for each in found if each.kind == "clock"]
-            return FollowedClip(detections, tracks, (*changes, *clocks))
+            lost = [each for each in lost if each.kind == "clock"]
+            clocks = _trace_clocks(cameras, fps, detections, tracks, track, lost)
+            told = [change_record(each, names[each.camera], frame) for each in clocks]
+            return FollowedClip(detections, tracks, (*changes, *told))
         changes.append(views[0])
         detections = open_detections(changes)
+
+
+def _trace_clocks(
+    cameras: Camera,
+    fps: float,
+    detections: KeypointDetections[ClipArray],
+    tracks: Tracking,
+    track: Callable[[KeypointDetections[ClipArray]], Tracking],
+    lost: Sequence[MeasuredChange],
+) -> list[MeasuredChange]:
+    """Return the changes of clocks, by people who are tracked with them taken back.
+
+    `lost` are those that keep people from meeting. Other arguments are as of `follow_changes`.
+    """
+    count, index = len(cameras.focal), tracks.detection_index
+    if count < 3 or not index.shape[2]:
+        return []
+    rows, clocks = np.arange(len(index)), list(lost)
+    taken_back = np.zeros((count, len(rows)))
+    for attempt in range(5):
+        parts, late = [_clock_part(each) for each in clocks], np.zeros_like(taken_back)
+        for part in parts:
+            late[part.camera] += part.size[0] * part.share(rows, len(rows))
+        if np.abs(late - taken_back).max() > 1.0:
+            index, taken_back = _track_in_time(detections, np.rint(late).astype(int), track), late
+        elif attempt:
+            break
+        people = detections.assign_people(index)
+        known = [*(Part(c, "constant", 0, (0.0,)) for c in range(count)), *parts]
+        settings = LOOSE if clocks else TriangulationSettings()
+        sums = sum_clip(cameras, people, fps, rows, known, settings)
+        found = find_changes(cameras, people, fps, rows, sums, start=parts)
+        clocks = [_keep_row(each, clocks, fps) for each in found if each.kind == "clock"]
+    return clocks
+
+
+def _keep_row(step: MeasuredChange, known: Sequence[MeasuredChange], fps: float) -> MeasuredChange:
+    """Return a step at the row where it was found first: moved rows have gaps around it."""
+    rows = [each.row for each in known if each.camera == step.camera and each.row is not None]
+    near = [row for row in rows if step.row is not None and abs(row - step.row) <= fps]
+    return replace(step, row=near[0]) if near else step
+
+
+def _clock_part(change: MeasuredChange) -> Part:
+    size = (float(change.amount[4]),)
+    if change.row is None:
+        return Part(change.camera, "drift", 0, size)
+    return Part(change.camera, "step", change.row, size)
+
+
+def _track_in_time(
+    detections: KeypointDetections[ClipArray],
+    late: Integers,
+    track: Callable[[KeypointDetections[ClipArray]], Tracking],
+) -> NDArray[np.integer]:
+    """Return people's detections (frames, cameras, persons), tracked with clocks taken back.
+
+    Row t of camera c shows the time of row t + `late` (cameras, frames).
+    """
+    count, frames = late.shape
+    source = np.full(late.shape, -1)
+    for c in range(count):
+        to = np.arange(frames) + late[c]
+        inside = (to >= 0) & (to < frames)
+        source[c, to[inside]] = np.flatnonzero(inside)
+    arrays = {name: _MovedRows(each, source) for name, each in detections.arrays().items()}
+    moved = track(replace(detections, **arrays)).detection_index
+    index = np.full_like(moved, -1)
+    for c in range(count):
+        to = np.flatnonzero(source[c] >= 0)
+        index[source[c, to], c] = moved[to, c]
+    return index
+
+
+@dataclass(frozen=True, eq=False)
+class _MovedRows:
+    """An array (frames, cameras, ...) with rows of cameras at other places, read by frames.
+
+    Attributes:
+        array: the array.
+        source: (cameras, frames) row that stands in a row; -1 = none, which is missing.
+    """
+
+    array: ClipArray
+    source: Integers
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.array.shape
+
+    def __getitem__(self, frames: slice | Integers, /) -> Singles:
+        source = self.source[:, frames]
+        first = int(source[source >= 0].min(initial=self.shape[0] - 1))
+        seen = np.asarray(self.array[first : int(source.max(initial=first)) + 1])
+        moved = seen[np.maximum(source - first, 0), np.arange(len(source))[:, None]].swapaxes(0, 1)
+        moved[(source < 0).T] = np.nan
+        return moved
 
 
 def _slow_change(change: CameraChange) -> CameraChange:
@@ -129,18 +234,10 @@ def add_changes(
         if is_by_chance(change):  # told, not taken back
             change = change.model_copy(update={"is_explained": False})
         same = [one for one in stay if is_same_change(one, change, fps)]
+        if change.kind == "clock" and any(one.kind == "clock" for one in known):
+            continue  # those were measured together, on people who were tracked by right clocks
         if not same:
             new.append(change)
         elif change.frame is None:  # the tracker measured the drift on the people that it had left
             stay[stay.index(same[0])] = join_changes(cameras[each.camera], same[0], change)
-    steps = [each for each in new if each.kind == "clock" and each.frame is not None]
-    stay = [one for one in stay if not any(_is_measured_again(one, each, fps) for each in steps)]
-    return [each for each in stay if not explains_clock(new, each)], new
-
-
-def _is_measured_again(known: CameraChange, step: CameraChange, fps: float) -> bool:
-    """Return whether a step of a clock is one that the tracker measured, coarsely."""
-    is_same = (known.camera, known.kind) == (step.camera, step.kind)
-    if not is_same or known.frame is None or step.frame is None:
-        return False
-    return abs(known.frame - step.frame) <= fps
+    return stay, new

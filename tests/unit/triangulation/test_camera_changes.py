@@ -15,7 +15,6 @@ from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.camera_changes import (
     change_record,
     correct_views,
-    explains_clock,
     find_changes,
     join_changes,
     move_on,
@@ -219,8 +218,7 @@ def test_a_camera_whose_people_meet_nobody_is_lost(cameras, spoil, row, amount):
     if found:
         assert abs(found[0].row - row) <= 1
         # What is left is measured when people are tracked again.
-        np.testing.assert_allclose(found[0].amount[:4], amount[:4], atol=4.0)
-        np.testing.assert_allclose(found[0].amount[4], amount[4], atol=0.3)
+        np.testing.assert_allclose(found[0].amount, amount, atol=4.0)
 
 
 @pytest.mark.parametrize("newcomers", [0, 1])
@@ -398,16 +396,6 @@ def test_a_far_knock_and_what_its_correction_leaves_are_one_motion():
     joined = move_on(pixels, np.array([12]), CAMERA, [join_changes(CAMERA, far, rest)])
     # A zoom after a turn is no turn after a zoom: 0.003 of 78 px.
     np.testing.assert_allclose(joined, both, atol=0.24)
-
-
-def test_a_drift_explains_a_step_that_the_tracker_tells(cameras):
-    (found,) = explain(cameras, view(cameras, fast))
-    drift = change_record(found, "b", np.arange(FRAMES))
-    for late, is_explained in ((3.5, True), (-3.5, False), (9.0, False)):
-        told = drift.model_copy(update={"frame": 180, "late_frames": late})
-        assert explains_clock([drift], told) == is_explained
-        assert not explains_clock([drift], told.model_copy(update={"camera": "a"}))
-        assert not explains_clock([KNOCK], told)
 
 
 def test_cameras_that_all_sway_agree_with_nobody(cameras):
