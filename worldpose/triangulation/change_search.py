@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,7 +118,8 @@ def _trace_clocks(
 
     `lost` are those that keep people from meeting. Other arguments are as of `follow_changes`.
     """
-    count, index = len(cameras.focal), tracks.detection_index
+    count = len(cameras.focal)
+    index: NDArray[np.integer] = tracks.detection_index
     if count < 3 or not index.shape[2]:
         return []
     rows, clocks = np.arange(len(index)), list(lost)
@@ -168,7 +170,9 @@ def _track_in_time(
         to = np.arange(frames) + late[c]
         inside = (to >= 0) & (to < frames)
         source[c, to[inside]] = np.flatnonzero(inside)
-    arrays = {name: _MovedRows(each, source) for name, each in detections.arrays().items()}
+    arrays: dict[str, Any] = {
+        name: _MovedRows(each, source) for name, each in detections.arrays().items()
+    }
     moved = track(replace(detections, **arrays)).detection_index
     index = np.full_like(moved, -1)
     for c in range(count):

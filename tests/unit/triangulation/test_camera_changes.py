@@ -13,7 +13,6 @@ from data_contracts.triangulation import HEALTH_MEASURES, CameraChange
 from worldpose.camera_consistency.health import CameraHealth, judge_health, measure_health
 from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.camera_changes import (
-    change_record,
     correct_views,
     find_changes,
     join_changes,

@@ -60,6 +60,7 @@ def test_what_the_people_show_again_of_a_lost_view_decides(monkeypatch, refined,
 
     monkeypatch.setattr(change_search, "refine_change", refine_change)
     monkeypatch.setattr(change_search, "find_lost_views", find_lost_views)
+    monkeypatch.setattr(change_search, "_trace_clocks", lambda *arguments: arguments[-1])
 
     def track(detections):
         return SimpleNamespace(detection_index=None, joints=detections.known)
@@ -76,19 +77,11 @@ def test_what_the_people_show_again_of_a_lost_view_decides(monkeypatch, refined,
         assert [each.camera for each in found.changes if each.kind == "clock"] == ["a"]
 
 
-def test_a_step_of_a_clock_that_joints_measure_again_is_told_once():
+def test_clocks_that_were_measured_while_people_were_tracked_are_told_once():
     told = KNOCK.model_copy(update={"kind": "clock", "shift_px": (0.0, 0.0), "late_frames": 6.0})
-    other = told.model_copy(update={"camera": "a"})
-    measured, far = (
-        MeasuredChange(1, "clock", row, np.array([0.0, 0.0, 0.0, 0.0, late]))
-        for row, late in ((21, 8.9), (35, 2.0))
-    )
-    frame = np.arange(FIRST, FIRST + 41)
-    found = change_search.add_changes(
-        [told, other], [measured, far], ("a", "b", "c"), None, frame, 10.0
-    )
-    assert found[0] == [other]
-    assert [(each.frame, each.late_frames) for each in found[1]] == [
-        (FIRST + 21, 8.9),
-        (FIRST + 35, 2.0),
-    ]
+    again = MeasuredChange(0, "clock", 35, np.array([0.0, 0.0, 0.0, 0.0, 2.0]))
+    frame, names = np.arange(FIRST, FIRST + 41), ("a", "b", "c")
+    stay, new = change_search.add_changes([told], [again, LOST], names, None, frame, 10.0)
+    assert (stay, [each.kind for each in new]) == ([told], ["view"])
+    stay, new = change_search.add_changes([], [again], names, None, frame, 10.0)
+    assert (stay, [each.late_frames for each in new]) == ([], [2.0])
