@@ -139,10 +139,7 @@ class Poser:
     image_size: tuple[float, float] | None = None
 
     def joints(self, track: MethodTrack, shape: Shape, place: Place = "transl") -> Floats:
-        """Return the joints (frames, 17, 3) [m] of one person.
-
-        The betas are used if the model is the body of `shape`.
-        """
+        """Return a person's joints (frames, 17, 3) [m], with betas if the model is `shape`'s."""
         model, count = self.model, len(track.frames)
         pose = np.zeros((count, 69))
         pose[:, : track.body_pose.shape[-1]] = track.body_pose
