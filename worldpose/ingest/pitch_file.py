@@ -25,9 +25,7 @@ NO_PITCH: Final = "none"
 def pitch_file(folder: Path, spec: MatchSpec) -> Path | None:
     """Return the file of the surveyed pitch; None = no pitch, or the standard one.
 
-    Raises:
-        InputError: match.yaml names a pitch file that is missing or outside, or has `pitch: none`
-            although pitch.json exists.
+    InputError if its file is missing or outside, or match.yaml has `pitch: none` beside pitch.json.
     """
     if spec.pitch == NO_PITCH:
         if (folder / "pitch.json").exists():
@@ -135,8 +133,7 @@ def _is_number(value: object) -> TypeGuard[float]:
 def require_free_pitch(folder: Path, runs: Sequence[str] = ()) -> None:
     """Raise InputError if pitch.json must not be written.
 
-    Raises:
-        InputError: match.yaml names another pitch, or none; or `runs` (MATCH/NUMBER) had its pitch.
+    That is if match.yaml names another pitch, or none, or `runs` (MATCH/NUMBER) had its pitch.
     """
     file = folder / "match.yaml"
     content = read_yaml(file) if file.exists() else None
