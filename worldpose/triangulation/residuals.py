@@ -202,12 +202,10 @@ class Buffers(NamedTuple):
 
 @compile_kernel
 def read_tile(observations: Observations, first: int, tiles: Tiles) -> None:
-    """Write the linearised observations of 64 joints by all cameras.
+    """Write `a`, `b`, `scale`, `precision`, `extra` of 64 joints in the tiles (cameras,).
 
-    Args:
-        observations: observations of all joints.
-        first: the first joint, counted over frames, persons, joints.
-        tiles: (cameras,), written: `a`, `b`, `scale`, `precision`, `extra`.
+    They are linearised observations. `first` is the first joint, counted over frames, persons,
+    joints.
     """
     for camera in range(len(tiles)):
         _gather(observations, first, camera, tiles[camera])
