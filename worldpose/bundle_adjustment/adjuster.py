@@ -112,8 +112,7 @@ class Adjuster:
     def find_objection(self, before: HeldOutErrors, after: HeldOutErrors, fixed: Flags) -> str:
         """Return the reason to refuse the whole change; empty without one.
 
-        Cameras with their own covariance, in a rig of more than `_SMALL_RIG`, need only
-        `judge_cameras`.
+        Cameras with their own covariance, in a rig above `_SMALL_RIG`, need only `judge_cameras`.
         """
         changed = ~fixed
         given = self.clip.given & changed

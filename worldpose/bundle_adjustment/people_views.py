@@ -61,8 +61,7 @@ def find_walkers(
 ) -> list[list[Floats]]:
     """Return the keypoints (frames, 12, 2) [px] of the people in each camera's images.
 
-    Raises:
-        InputError: a camera shows no person for long enough, or no person walks.
+    InputError if a camera shows no person for long enough, or no person walks.
     """
     min_motion = 0.25
     every = []
@@ -179,8 +178,7 @@ class Views:
     def starts(self) -> list[Start]:
         """Return the cameras from the best pairs.
 
-        Raises:
-            InputError: no two cameras show one person, or one shares no person with the others.
+        InputError if no two cameras show one person, or one shares no person with the others.
         """
         pairs = [self._pair(a, b) for a, b in combinations(range(len(self.names)), 2)]
         good = sorted((one for one in pairs if one is not None), key=lambda one: -one.worth)
@@ -453,10 +451,8 @@ def adjust_poses(
     """Return cameras and joints adjusted to the keypoints, or the joints alone.
 
     The first camera stays where it is, and the second one at its distance: no keypoint tells the
-    world frame. Lenses are the prior of focal lengths and principal points.
-
-    Raises:
-        InputError: the keypoints do not determine the cameras.
+    world frame. Lenses are the prior of focal lengths and principal points. InputError if the
+    keypoints do not determine the cameras.
     """
     fixed_information = 1e12  # a step of a micrometre costs one [1/m^2]
     count = len(lenses)
