@@ -71,11 +71,8 @@ def identity_scores(
     """Return the identity scores of predicted tracks against true people.
 
     `distances` (frames, true, predicted persons) [m] are infinite where either is absent; `gate`
-    [m] is the maximum of a match.
-
-    Note:
-        IDF1: Ristani et al., ECCV-W 2016. Switches and fragmentations: Bernardin and Stiefelhagen,
-        2008, as counted by MOTChallenge. HOTA: Luiten et al., IJCV 2021.
+    [m] is the maximum of a match. IDF1: Ristani et al., ECCV-W 2016. Switches and fragmentations:
+    Bernardin and Stiefelhagen, 2008, as counted by MOTChallenge. HOTA: Luiten et al., IJCV 2021.
     """
     both = true_exists[:, :, None] & predicted_exists[:, None, :]
     distances = np.where(both, distances, np.inf)
@@ -376,10 +373,7 @@ def match_tracks(
     `people` and `true` are (frames, persons, 17, 3) [m], NaN where missing, `distances` (frames,
     true, predicted persons) [m], `match` (frames, true persons) the matches by these. With a
     camera, boxes in its image are compared: `boxes` (frames, predicted persons, 4) [px], or those
-    of the joints.
-
-    Raises:
-        InputError: camera and truth have different numbers of frames.
+    of the joints. InputError if the camera has another number of frames.
     """
     if camera is not None:
         if camera.batch_shape not in ((), (1,), (len(true),)):

@@ -16,13 +16,7 @@ Index = NDArray[np.integer] | Flags | slice
 
 
 def take_rows(record: Record, index: Index, *shared: str) -> Record:
-    """Return a record with some rows of its arrays.
-
-    Args:
-        record: dataclass or named tuple of arrays (n, ...).
-        index: the rows.
-        shared: fields that stay as they are.
-    """
+    """Return a record of arrays (n, ...) with some of their rows; `shared` fields stay."""
     return type(record)(
         *(
             getattr(record, name) if name in shared else getattr(record, name)[index]

@@ -18,11 +18,9 @@ from typing import TypeAlias
 
 @dataclass(frozen=True)
 class EmbeddedPage:
-    """A whole HTML page that is shown in a frame of its own, such as the 3D viewer with clips.
+    """A whole HTML page in a frame of its own, such as the 3D viewer, with a title for readers.
 
-    Attributes:
-        title: names the frame to screen readers.
-        html: the page; its scripts are modules and stand inside.
+    Its scripts are modules and stand inside.
     """
 
     title: str
@@ -31,12 +29,7 @@ class EmbeddedPage:
 
 @dataclass(frozen=True)
 class LinkedFile:
-    """A file beside the page, which a reader opens by a link.
-
-    Attributes:
-        title: text of the link.
-        name: name of the file, in the folder of the page.
-    """
+    """A file in the folder of the page, which a reader opens by a link with a title as its text."""
 
     title: str
     name: str
@@ -52,13 +45,7 @@ class CaptionedImage:
 
 @dataclass(frozen=True)
 class Table:
-    """A table with a heading.
-
-    Attributes:
-        heading: title of the table.
-        columns: titles; the prefix ">" marks numeric columns.
-        rows: rows of text.
-    """
+    """A table with a heading and rows of text; the prefix ">" of columns marks numeric ones."""
 
     heading: str
     columns: tuple[str, ...]
@@ -67,13 +54,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Section:
-    """A section of the page with a link in its navigation bar.
-
-    Attributes:
-        heading: also in the navigation bar.
-        blocks: blocks in this order.
-        lead: introduction.
-    """
+    """A section of the page with a link in its navigation bar, a lead, and blocks in order."""
 
     heading: str
     blocks: tuple[CaptionedImage | Table | EmbeddedPage | LinkedFile, ...]
@@ -88,9 +69,7 @@ class Failure(str):
 class Folded:
     """Collapsible tables at the end of a page; all but the first are folded.
 
-    Attributes:
-        heading: also in the navigation bar.
-        tables: tables without rows are left out.
+    Tables without rows are left out; the heading is also in the navigation bar.
     """
 
     heading: str

@@ -28,12 +28,9 @@ Picture = tuple[str, int | None]
 
 @dataclass(frozen=True)
 class Replay:
-    """A match folder with corrections applied; its files are unchanged.
+    """A match folder with corrections applied, in the order they were made; its files stay.
 
-    Attributes:
-        folder: match folder with the corrected clicks.
-        applied: the applied corrections, in the order they were made.
-        stale: the corrections that no longer apply, each with the reason.
+    `stale` are the corrections that no longer apply, each with the reason.
     """
 
     folder: MatchFolder

@@ -46,7 +46,6 @@ class ArrowFactor:
     """Factor of an arrow matrix.
 
     Attributes:
-        band: factor of the band.
         border: (frames, n, shared)
         answer: (frames, n, shared) B^-1 E.
         reduced: (shared, shared) Schur complement.
