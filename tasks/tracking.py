@@ -334,8 +334,7 @@ def _track_on_plane(
 ) -> tuple[Identities, dict[str, float], str] | None:
     """Add the people who are not triangulated, tracked by their feet.
 
-    Returns:
-        The people, metrics, and a sentence on clocks; None without any of them.
+    Return them, metrics, and a sentence on clocks; None without any of them.
     """
     is_triangulated = _mark(found.detection_index, clip)
     feet = _locate_feet(clip, pitch, ~is_triangulated)
