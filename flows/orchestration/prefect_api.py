@@ -46,8 +46,7 @@ class PrefectApi:
     def ask(self, path: str, body: Any = None, *, method: str | None = None) -> Any:  # noqa: ANN401
         """Send a request, by default a POST if there is a body; return the answer's JSON.
 
-        Raises:
-            UnreachablePrefectError: the server does not answer, or refuses.
+        UnreachablePrefectError if the server does not answer, or refuses.
         """
         headers = {}
         key = os.environ.get(CLOUD_LOGIN)
