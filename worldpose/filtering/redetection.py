@@ -59,12 +59,9 @@ class Expected:
 
     @classmethod
     def of(cls, views: BodyViews, offset: Floats, focal: float) -> Expected:
-        """Return the expected image of the bodies in the only camera of `views`.
+        """Return the expected image of bodies in the one camera of `views`, of a focal length [px].
 
-        Args:
-            views: bodies in the frames of one camera.
-            offset: (frames, persons, 17, 2) [px] expected offset of keypoints from the joints.
-            focal: focal length of the camera [px].
+        The offset (frames, persons, 17, 2) [px] of keypoints from the joints is the expected one.
         """
         scale = views.scale[:, 0]
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -88,10 +88,6 @@ class ArrowFactor:
         return np.asarray(np.linalg.inv(0.5 * (self.reduced + self.reduced.T)))
 
     def frame_covariance(self, shared: Floats) -> Floats:
-        """Return the covariance (frames, n, n) of each frame's parameters.
-
-        Args:
-            shared: covariance (shared, shared) of the shared parameters.
-        """
+        """Return covariances (frames, n, n) of frames by that of shared ones (shared, shared)."""
         spread = self.answer @ shared @ np.swapaxes(self.answer, -1, -2)
         return np.asarray(self.band.inverse_blocks() + spread)
