@@ -274,10 +274,7 @@ def frame_arrays(fit: BodyFit) -> dict[str, NDArray[Any]]:
 
 
 def find_same_body(inputs: UnitInputs) -> BodyModel:
-    """Return the body model of a unit.
-
-    InputError if this worker has another file of that name, UsageError if it has none.
-    """
+    """Return the body model of a unit; UsageError without one, InputError if it is another."""
     folder = None if inputs.work.body_folder is None else Path(inputs.work.body_folder)
     name = str(inputs.recipe.settings["body_model"])
     return find_body(name, folder, inputs.sources["body_model_sha256"])

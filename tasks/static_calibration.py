@@ -168,10 +168,7 @@ def clicked_markings(listed: Mapping[str, Any]) -> ClickedMarkings:
 
 
 def open_still(inputs: UnitInputs) -> NDArray[np.uint8] | None:
-    """Return the unit's still, or one without people from its video, from the files of its key.
-
-    InputError if the file differs from the registered one, or is not an image.
-    """
+    """Return the unit's still, or one without people from its video; InputError if it changed."""
     sources = inputs.sources
     if sources["still"] is None:
         filmed = sources["filmed"]

@@ -109,10 +109,7 @@ def _digest(data: bytes) -> str:
 
 
 def parse_source(source: bytes) -> ParsedSource:
-    """Return the properties of a source.
-
-    SyntaxError if it is not valid Python, ValueError if it contains a zero byte.
-    """
+    """Return the properties of a source; SyntaxError or ValueError if it is not Python."""
     tree = parse_in_turn(lambda: ast.parse(source))
     nodes = _drop_text(tree)
     texts = {node.value for node in nodes if isinstance(node, ast.Constant)}

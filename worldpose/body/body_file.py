@@ -76,10 +76,7 @@ def load_body(path: Path) -> BodyModel:
 
 
 def save_body(path: Path, model: BodyModel) -> None:
-    """Write a model in single precision, to 0.1 um; the file appears complete or not at all.
-
-    InputError if the file exists and differs.
-    """
+    """Write a model in single precision, 0.1 um, whole or not at all; InputError if it differs."""
     root = np.where(model.parents < 0, np.iinfo(np.uint32).max, model.parents)
     arrays = {
         "v_template": model.template.astype(np.float32),
@@ -263,10 +260,7 @@ def body_path(name: str, folder: Path | None = None) -> Path:
 
 
 def digest_of_body(name: str, folder: Path | None = None) -> str:
-    """Return the SHA-256 of an installed model's file; UsageError if there is none.
-
-    The folder is `body_folder()` by default.
-    """
+    """Return the SHA-256 of an installed model's file; UsageError if there is none."""
     return hashlib.sha256(_find_installed(name, folder).read_bytes()).hexdigest()
 
 

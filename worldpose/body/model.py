@@ -269,10 +269,7 @@ def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> N
 def cluster_vertices(
     vertices: NDArray[np.float64], faces: NDArray[np.int64], keys: NDArray[Any]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return one vertex for each cell, nearest to the cell's mean, and the faces between these.
-
-    `keys` (vertices, k) tell the cell of each vertex.
-    """
+    """Return a vertex for each cell, `keys` (vertices, k), nearest to its mean, and the faces."""
     _, cell = np.unique(keys, axis=0, return_inverse=True)
     cell = cell.ravel()
     count = np.bincount(cell)

@@ -192,10 +192,7 @@ def _damp(blocks: Floats) -> Floats:
 
 
 def factor(blocks: Floats) -> BandedFactor:
-    """Return the factor of blocks with a little damping, which overwrites the blocks.
-
-    DegenerateError if rounding leaves no positive definite system.
-    """
+    """Return the factor of slightly damped blocks, overwritten; DegenerateError by rounding."""
     solved = BandedFactor.of(_damp(blocks), overwrite=True)
     if not solved.determined:
         raise DegenerateError(

@@ -382,10 +382,7 @@ def _select_flow(
 
 
 def _keep_frames(clip: BroadcastClip, wanted: set[int], kept: dict[int, Image]) -> Iterator[Image]:
-    """Yield all frames, and store the wanted ones in `kept`.
-
-    InputError if people, boxes or camera data have other frames than the pictures.
-    """
+    """Yield all frames, and keep the wanted ones; InputError if people or data have others."""
     given = set() if clip.boxes is None else {len(clip.boxes)}
     given |= set() if clip.people is None else {len(clip.people.joints)}
     given |= set() if clip.given is None else {len(clip.given.values)}

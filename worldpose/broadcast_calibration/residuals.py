@@ -439,10 +439,7 @@ def _add_flow(
     term_weight: float,
     system: ArrowSystem,
 ) -> float:
-    """Add followed points to the normal equations and return their cost; see `_add_points`.
-
-    Points `edges[t]` to `edges[t + 1]` begin in frame t.
-    """
+    """Add followed points from frame t, `edges[t]` to `edges[t + 1]`, and return their cost."""
     blocks, border, corner = system.blocks, system.border, system.corner
     right, right_corner = system.right, system.right_corner
     cost = 0.0

@@ -246,10 +246,7 @@ def place_people(clip: Clip, frames: Integers) -> Floats:
 
 
 def _select_observations(observed: Observations, kept: Flags) -> Observations:
-    """Return the observations (n,) that are kept, with renumbered points.
-
-    A point left with a single observation carries no information and is dropped.
-    """
+    """Return the observations (n,) that are kept, renumbered, without points of a single one."""
     kept = kept & (
         np.bincount(observed.point_of[kept], minlength=len(observed.points))[observed.point_of] > 1
     )

@@ -111,10 +111,7 @@ def _height(track: Floats) -> float:
 
 
 def _walking_distance(track: Floats) -> float:
-    """Return the distance that a person moves in the image, in heights of the person [1].
-
-    A change of size counts as motion: that person walks towards the camera.
-    """
+    """Return how far a person moves or changes in size in the image, in the person's heights."""
     seen = track[_frames(track)]
     middle = np.nanmean(seen, axis=1)
     tall = np.nanmax(seen[..., 1], axis=1) - np.nanmin(seen[..., 1], axis=1)

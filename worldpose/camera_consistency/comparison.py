@@ -304,10 +304,7 @@ class Comparison:
 
 
 def chance_noise(chance: float) -> float:
-    """Return the standard deviation of the number of chance matches per frame.
-
-    A clip has some ten independent moments: people move slowly.
-    """
+    """Return the deviation of chance matches per frame: a clip has some ten independent moments."""
     return 0.3 * math.sqrt(float(chance) + 0.05)
 
 

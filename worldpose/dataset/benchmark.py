@@ -63,10 +63,7 @@ def is_data_set(folder: Path) -> bool:
 
 
 def parts_of_clips(folder: Path) -> dict[str, Path]:
-    """Return the folder of each clip: the folder itself, or the splits of a release below it.
-
-    InputError if there are no clips, or one is in two folders.
-    """
+    """Return the folder of each clip, or of a release's splits; InputError for none or doubles."""
     splits = sorted({path.parents[1] for path in folder.glob("*/poses/*.npz")})
     own = any(path for form in (*FORMS, *SUBMISSIONS) for path in folder.glob(form))
     parts: dict[str, Path] = {}

@@ -77,10 +77,7 @@ class CameraView:
         return len(self.rows.rotation) > 1
 
     def shared_points(self, source: PointSource) -> tuple[Floats, Integers] | None:
-        """Return the 2D of the points that a source also has, and their indices in the source.
-
-        None without 2D, or if the numbers of people differ.
-        """
+        """Return the 2D of points that a source has too, and their indices in it; or None."""
         if self.pixels is None or self.pixels.shape[1] != source.points.shape[1]:
             return None
         shared = [name for name in self.skeleton if name in source.skeleton]

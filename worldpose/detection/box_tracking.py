@@ -157,10 +157,7 @@ class BoxCleaner:
     def clean(
         self, frames: Iterable[tuple[int, Image | None, People | None]]
     ) -> Iterator[tuple[int, Image | None, People]]:
-        """Yield each frame with the people in it.
-
-        Frames are rising numbers, images, and detections; None where no detector ran.
-        """
+        """Yield each frame with the people in it, of frames with None where no detector ran."""
         gap, later = self._settings.longest_gap, self._settings.min_hits - 1
         for number, image, people in frames:
             self._held.append(_BufferedFrame(number, image))

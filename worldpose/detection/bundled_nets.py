@@ -364,10 +364,7 @@ def _find_candidates(chance: Singles, count: int, least: np.float32) -> tuple[Si
 
 
 def save_weights(path: Path, net: nn.Module, about: dict[str, str] | None = None) -> None:
-    """Write a net's weights atomically; equal weights give equal bytes.
-
-    An existing file is replaced; `about` is further metadata, such as the origin of the weights.
-    """
+    """Write a net's weights, with metadata `about`, atomically; equal weights give equal bytes."""
     tensors = {name: value.detach().contiguous() for name, value in net.state_dict().items()}
     data = save(tensors, {**(about or {}), FORMAT: type(net).__name__})
     # The library orders metadata at random.

@@ -71,10 +71,7 @@ class PlacedNet:
                     module.to(self._kind)
 
     def __call__(self, *given: Given) -> Tensors:
-        """Return the outputs, on the device, for images (batch, height, width, 3) of bytes.
-
-        There is at least one image; what else the net takes follows.
-        """
+        """Return the outputs, on the device, for images (batch, height, width, 3) of bytes."""
         found, start = list[Tensors](), 0
         while start < len(given[0]):
             part = [each[start : start + self.batch] for each in given]

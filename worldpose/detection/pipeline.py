@@ -128,10 +128,7 @@ class DetectionReport:
         return {"images_per_s": self.frames / whole, **shares}
 
     def why_no_person(self) -> str | None:
-        """Return the likely reason why a clip of 20 frames or more shows no person.
-
-        None: people were found, or the clip is shorter.
-        """
+        """Return the likely reason why a clip of 20 frames or more shows no person; else None."""
         frames = self.frames - len(self.unreadable)
         if self.detections or frames < 20:
             return None

@@ -261,10 +261,7 @@ def merge_tracks(pairs: Integers, cost: Floats) -> Integers:
 
 
 def take_matched(people: Floats, match: Integers) -> Floats:
-    """Return predicted people in the order of the true ones (frames, true, joints, 3).
-
-    The match (frames, true persons) has the index of the predicted person; -1, none, gives NaN.
-    """
+    """Return predicted people in the order of `match` (frames, true persons), NaN for -1, none."""
     if not people.shape[1]:
         return np.full((*match.shape, *people.shape[2:]), np.nan)
     chosen = np.take_along_axis(people, np.maximum(match, 0)[..., None, None], axis=1)

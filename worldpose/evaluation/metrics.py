@@ -85,10 +85,7 @@ def mid_hip(joints: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class AlignedErrors:
-    """Joint distances after alignment; NaN where a joint is missing on either side.
-
-    Distances are (frames, persons, 14) [m], on `paper_joints`.
-    """
+    """Joint distances (frames, persons, 14) [m] of `paper_joints` once aligned, NaN if missing."""
 
     shared: Floats
     """One alignment for all people's whole trajectories."""

@@ -131,10 +131,7 @@ def known_id(name: str, known: Collection[str]) -> str:
 def index_by_name(
     path: Path, cameras: list[tuple[str, CameraCalibration]]
 ) -> dict[str, CameraCalibration]:
-    """Return the cameras of pairs of place and camera by id, in file order.
-
-    InputError if there is no camera, two have one name, or none has a pose.
-    """
+    """Return cameras by id, in file order; InputError for none, two of one name, or no pose."""
     by_name: dict[str, CameraCalibration] = {}
     for where, camera in cameras:
         if camera.id in by_name:

@@ -92,10 +92,7 @@ XML, of which annotations and calibrations have five."""
 
 
 def read_yaml(path: Path) -> Any:  # noqa: ANN401
-    """Return the only document of a YAML file, as plain values, without aliases or repeated keys.
-
-    Dates stay text, so that `match_id: 2024-05-01` is a name.
-    """
+    """Return the only document of a YAML file, dates as text, without aliases or repeated keys."""
     return parse_yaml(str(path), read_text(path, SETTINGS_BYTES))
 
 

@@ -68,10 +68,7 @@ def write_keypoint_arrays(path: Path, people: KeypointDetections) -> None:
 
 
 def read_keypoint_arrays(path: Path) -> KeypointDetections:
-    """Return the people of an npz file as stored; frames rise, possibly with gaps.
-
-    The function checks every declared type, shape and size before it unpacks data.
-    """
+    """Return the people of an npz file as stored; frames rise, possibly with gaps."""
     points_limit = 1000  # maximum number of these points
     require_file(path)
     extra_members = ("point", "extra_keypoints", "extra_confidence")  # all or none

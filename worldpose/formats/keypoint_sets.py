@@ -123,10 +123,7 @@ the simulation miss by 0.03 to 0.15, wrong ones by 0.5 or more."""
 
 
 def order_by_names(where: str, names: Sequence[str]) -> PointOrder:
-    """Return the order of points whose names a file gives, in any usual spelling.
-
-    A set may lack joints of the face; InputError if it lacks others, or two names are the same.
-    """
+    """Return the order of points by names in any spelling; only face joints may be missing."""
     plain = [_plain(str(name)) for name in names]
     if "left_ankle" not in plain:  # Human3.6M calls them feet
         plain = [re.sub(r"^(left|right)_foot$", r"\1_ankle", name) for name in plain]

@@ -119,10 +119,7 @@ def read_lenses(
 def read_lens_toml(
     file: Path, sizes: Mapping[str, tuple[int, int]], camera: str | None = None
 ) -> dict[str, LensCalibration]:
-    """Return the lenses of a TOML file by camera, or of the one; poses are ignored.
-
-    `sizes` are as in `read_lenses`; the file may have further cameras.
-    """
+    """Return a TOML file's lenses by camera, or one, without poses; see `read_lenses`."""
     return _lenses(file, camera_tables(file), sizes, camera)
 
 
@@ -329,10 +326,7 @@ def _chain(
 
 
 def _read_mapping(file: Path) -> dict[str, Any]:
-    """Return numbers, arrays and texts of plain JSON, YAML or TOML, as of ROS's camera_calibration.
-
-    A matrix is a list of rows, or a mapping with `rows`, `cols` and `data`.
-    """
+    """Return plain JSON, YAML or TOML; matrices are rows, or ROS's `rows`, `cols` and `data`."""
     suffix = file.suffix.lower()
     content: Any = read_toml(file) if suffix == ".toml" else None
     if content is None:
@@ -379,10 +373,7 @@ def _pick(where: str, given: Mapping[str, Any], names: Sequence[str], what: str)
 
 
 def _image_size(given: Mapping[str, Any]) -> tuple[int, int] | None:
-    """Return the image size in a file, as two numbers, `width` and `height`, or "1920x1080".
-
-    Other entries of such names, as of a board or of numpy's shape, are none.
-    """
+    """Return the image size in a file, as two numbers, `width` and `height`, or "1920x1080"."""
     number = r"(\d+\.?\d*(?:e[-+]?\d+)?)"
     for names in SIZE_NAMES:
         value = [given[key] for key in (_key(given, [name]) for name in names) if key]

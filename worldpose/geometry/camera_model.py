@@ -85,10 +85,7 @@ def view(
 
 @inline_kernel
 def by_world(camera: CameraNumbers, gx: float, gy: float, gz: float) -> tuple[float, float, float]:
-    """Return derivatives by a world point from those by the point in camera axes.
-
-    The derivatives by the camera's center are their negatives.
-    """
+    """Return derivatives by a world point from those in camera axes; by the center, minus these."""
     wx = gx * camera.r00 + gy * camera.r10 + gz * camera.r20
     wy = gx * camera.r01 + gy * camera.r11 + gz * camera.r21
     wz = gx * camera.r02 + gy * camera.r12 + gz * camera.r22

@@ -30,10 +30,7 @@ INTRINSICS: Final = _PARAMETERS[:4]
 
 @dataclass(frozen=True, eq=False)
 class FittedLens:
-    """A single camera's lens, at the origin, fitted to places (n, 2) on the plane z = 1.
-
-    Their pixels are (n, 2) [px].
-    """
+    """A lens at the origin fitted to places (n, 2) on the plane z = 1 and their pixels (n, 2)."""
 
     camera: Camera
     plane: Floats

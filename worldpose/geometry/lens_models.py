@@ -61,10 +61,7 @@ WIDTH: Final = 26
 
 
 class CameraNumbers(NamedTuple):
-    """Numbers of a camera's row, for functions of one point.
-
-    A tuple stays in registers; for an array, references would be counted at every call.
-    """
+    """Numbers of a camera's row in registers: an array's references would be counted each time."""
 
     fx: float
     fy: float

@@ -26,10 +26,7 @@ def take_rows(record: Record, index: Index, *shared: str) -> Record:
 
 
 def join_rows(parts: Sequence[Record], *shared: str) -> Record:
-    """Return one record with the arrays of one or more records, one after another.
-
-    `shared` are fields that all records have in common.
-    """
+    """Return one record with the arrays of some, one after another, and their `shared` fields."""
     return type(parts[0])(
         *(
             getattr(parts[0], name)

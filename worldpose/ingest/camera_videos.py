@@ -68,10 +68,7 @@ def find_videos(
 def without_strays(
     folder: Path, found: Mapping[str, Path], cameras: Collection[str]
 ) -> dict[str, Path]:
-    """Return the videos of `find_videos` that are of cameras, perhaps not all of these cameras.
-
-    Beside videos in the folder itself, the only video of a subfolder may be anything.
-    """
+    """Return the videos of cameras; beside videos in a folder, a subfolder's may be anything."""
     is_mixed = bool(_films_in(folder))
     return {
         name: file

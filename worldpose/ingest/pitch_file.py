@@ -23,10 +23,7 @@ NO_PITCH: Final = "none"
 
 
 def pitch_file(folder: Path, spec: MatchSpec) -> Path | None:
-    """Return the file of the surveyed pitch; None = no pitch, or the standard one.
-
-    InputError if its file is missing or outside, or match.yaml has `pitch: none` beside pitch.json.
-    """
+    """Return the file of the surveyed pitch, or None; InputError if match.yaml contradicts it."""
     if spec.pitch == NO_PITCH:
         if (folder / "pitch.json").exists():
             raise _two_pitches(folder, NO_PITCH)

@@ -138,10 +138,7 @@ def reachable(folder: Path) -> Iterator[None]:
 
 
 def find_file(folder: Path, name: str) -> Path:
-    """Return the path of a file of a folder, which need not exist.
-
-    Its name on disk may differ as the names of `same_name` do.
-    """
+    """Return the path of a folder's file, which need not exist; `same_name` compares its name."""
     path = folder
     for part in PurePosixPath(name).parts:
         if not (path / part).exists() and path.is_dir():
@@ -152,10 +149,7 @@ def find_file(folder: Path, name: str) -> Path:
 
 
 def same_name(name: str) -> str:
-    """Return the form in which names of files are compared.
-
-    Cameras write endings in capitals, and macOS writes letters and their accents apart.
-    """
+    """Return the form to compare file names in: cameras write capitals, macOS splits accents."""
     composed = PurePosixPath(unicodedata.normalize("NFC", name))
     return composed.stem + composed.suffix.lower()
 

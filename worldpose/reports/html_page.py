@@ -18,10 +18,7 @@ from typing import TypeAlias
 
 @dataclass(frozen=True)
 class EmbeddedPage:
-    """A whole HTML page in a frame of its own, such as the 3D viewer, with a title for readers.
-
-    Its scripts are modules and stand inside.
-    """
+    """A whole HTML page in a frame of its own, such as the 3D viewer with clips."""
 
     title: str
     html: str
@@ -67,10 +64,7 @@ class Failure(str):
 
 @dataclass(frozen=True)
 class Folded:
-    """Collapsible tables at the end of a page; all but the first are folded.
-
-    Tables without rows are left out; the heading is also in the navigation bar.
-    """
+    """Collapsible tables at the end of a page, without empty ones; all but the first are folded."""
 
     heading: str
     tables: tuple[Table, ...]
@@ -84,10 +78,7 @@ def whole_page(
     tiles: Sequence[tuple[str, str]] = (),
     last: Folded | None = None,
 ) -> str:
-    """Return a whole HTML page, without the sections that have no blocks.
-
-    Tiles are key metrics at the top, each with its label.
-    """
+    """Return a whole HTML page, without empty sections, and with key metrics as tiles."""
     shown = [section for section in sections if section.blocks]
     allowed = " ".join(dict.fromkeys(_allowed_scripts(shown)))
     policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"

@@ -28,10 +28,7 @@ Picture = tuple[str, int | None]
 
 @dataclass(frozen=True)
 class Replay:
-    """A match folder with corrections applied, in the order they were made; its files stay.
-
-    `stale` are the corrections that no longer apply, each with the reason.
-    """
+    """A match folder with corrections applied in order, and the `stale` ones, with reasons."""
 
     folder: MatchFolder
     applied: tuple[Correction, ...] = ()

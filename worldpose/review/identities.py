@@ -221,10 +221,7 @@ def _called(found: Identities, person: int) -> str:
 
 
 def find_sighting(found: Identities, person: int, first: int = 0) -> Sighting | None:
-    """Return a person's detection with the smallest ray distance from match frame `first` on.
-
-    None without detections.
-    """
+    """Return a person's detection of smallest ray distance from match frame `first` on, or None."""
     k = found.person.tolist().index(person)
     seen = (found.detection_index[:, :, k] >= 0) & (found.frame >= first)[:, None]
     if not seen.any():

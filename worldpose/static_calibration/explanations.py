@@ -358,10 +358,7 @@ def _start_on_pitch(
     size: _PitchSize,
     settings: StaticCalibrationSettings,
 ) -> tuple[CameraProblem, Floats] | None:
-    """Return the clicked points on a pitch of another size, and a camera (WIDTH,) near the answer.
-
-    None if a point is not in the Laws, or the points determine no camera.
-    """
+    """Return clicked points on a pitch of another size, and a camera (WIDTH,); None if unknown."""
     evidence, laws = problem.evidence, prescribed_points(pitch.spec, size[:2])
     if not set(evidence.points) <= laws.keys() or not has_enough_points(evidence):
         return None

@@ -40,10 +40,7 @@ _hook: Callable[[str], None] | None = None
 
 
 def install_fault_hook(hook: Callable[[str], None] | None) -> None:
-    """Call `hook` with the name of every commit point reached from now on; None removes it.
-
-    For fault tests only: no product code installs one.
-    """
+    """Call `hook` with the name of every commit point from now on, in fault tests; None ends it."""
     global _hook
     _hook = hook
 
@@ -76,10 +73,7 @@ class Blobs(Protocol):
         """Return the content at `path`, None if there is none."""
 
     def read_range(self, path: str, start: int, stop: int) -> bytes | None:
-        """Return the bytes from `start` to before `stop`, fewer if the content ends before them.
-
-        None if there is nothing at `path`.
-        """
+        """Return the bytes from `start` to before `stop` or the end; None without content."""
 
     def digest(self, path: str) -> tuple[int, str] | None:
         """Return size [byte] and SHA-256 of the content at `path`, None if there is none."""

@@ -25,10 +25,7 @@ _CONTAINERS: Final = (dict, list, tuple)
 
 
 def canonical_json(value: object) -> bytes:
-    """Return the JSON of `value`: sorted keys, no spaces, UTF-8, finite numbers only.
-
-    InputError for NaN, infinity, a key that is not text, a lone surrogate, or an array.
-    """
+    """Return the JSON of `value`, sorted and in UTF-8; InputError if it has no exact JSON form."""
     try:
         text = json.dumps(
             value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
@@ -84,10 +81,7 @@ def seal(record: Record) -> bytes:
 
 
 def unseal(kind: type[R], data: bytes, where: str) -> R:
-    """Return the record in the document `data`, which messages call `where`.
-
-    CorruptionError if the bytes differ from the sealed ones, InputError for another version's.
-    """
+    """Return the record in `data`; CorruptionError if damaged, InputError of another version."""
     content = _content_after_seal(data)
     if content is not None:
         try:

@@ -381,10 +381,7 @@ class Run(Mapping[str, "xr.Dataset"]):
         return self._best(clip, BODY_STAGES)
 
     def joints(self, clip: str) -> xr.Dataset:
-        """Return the best result with `joints` and `covariance` of a clip, bodies first.
-
-        InputError if the run has no joints of the clip.
-        """
+        """Return the best result with `joints` and `covariance` of a clip, or InputError."""
         return self._best(clip, JOINT_STAGES)
 
     def _best(self, clip: str, stages: Sequence[str]) -> xr.Dataset:

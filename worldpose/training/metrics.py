@@ -59,10 +59,7 @@ def stored_people(
     estimator: PoseEstimator,
     settings: DetectionSettings | None = None,
 ) -> People:
-    """Return the people in an image as the stage stores them, the crowd included.
-
-    Scores are those before `ScoreMap`.
-    """
+    """Return the people in an image as stored, crowd included, with scores before `ScoreMap`."""
     chosen = settings or DetectionSettings()
     kept = people.scores >= chosen.low_score_threshold
     people = people.select(kept)

@@ -335,10 +335,7 @@ def _view_motion(camera: Camera, amount: Floats) -> Floats:
 def _turn_rows(
     pixels: Floats, share: Floats, camera: Camera, amount: Floats, *, back: bool
 ) -> None:
-    """Move pixels (frames, ..., 2) in place by shares (frames,) of a view's motion.
-
-    `back` gives the pixels that the camera had shown before its view changed.
-    """
+    """Move pixels (frames, ..., 2) in place by shares (frames,) of a view's motion, or `back`."""
     unturned = replace(camera, cam_from_world=Rigid.identity())
     for part in np.unique(share[share > 0.0]):
         rows, motion = pixels[share == part], _view_motion(camera, part * amount)

@@ -124,10 +124,7 @@ def add_slow_drifts(
 def shift_by_courses(
     detections: KeypointDetections, courses: Sequence[Course]
 ) -> tuple[KeypointDetections, Floats]:
-    """Return the nearest frames on the common clock, and what is left of the offsets [frame].
-
-    Detections are (frames, cameras, detections), offsets that are left (frames, cameras).
-    """
+    """Return the nearest frames on the common clock, and offsets left (frames, cameras) [frame]."""
     frames, count = detections.score.shape[:2]
     frame = np.arange(frames)
     course = np.stack([np.interp(frame, *np.array(each).T) for each in courses], axis=1)

@@ -103,10 +103,7 @@ def reinterpret_calibration(
 
 
 def _reach(detections: KeypointDetections) -> Floats:
-    """Return how far right and down keypoints are in each camera (cameras, 2) [px]; 0 = none.
-
-    Detectors guess some keypoints beyond the border.
-    """
+    """Return how far right and down keypoints are in each camera (cameras, 2) [px]; 0 = none."""
     inside = 0.98  # share of keypoints within the image [1]
     reach = np.zeros((detections.keypoints.shape[1], 2))
     for camera in range(len(reach)):

@@ -253,10 +253,7 @@ def _gather(observations: Observations, first: int, camera: int, tile: Tile) -> 
 
 @compile_kernel
 def _linearize(tile: Tile, cameras: Floats, camera: int) -> None:
-    """Turn the pixels of one of the cameras into equations.
-
-    Observations are dropped where the lens model has no inverse, and for a missing camera.
-    """
+    """Turn a camera's pixels into equations, but those where the camera or lens gives no ray."""
     a, b, scale, precision = tile["a"], tile["b"], tile["scale"], tile["precision"]
     if not is_finite(cameras, camera):
         a[:], b[:], scale[:], precision[:] = 0.0, 0.0, 0.0, 0.0

@@ -398,10 +398,7 @@ class _Table:
     def _join(
         self, curves: dict[tuple[int, int], Floats], drawn: dict[tuple[int, int], Floats]
     ) -> tuple[list[list[int]], Integers, list[str]]:
-        """Return groups of cameras, each in the order of clearness, their offsets, and reasons.
-
-        A camera that joins no group can begin another one.
-        """
+        """Return groups of cameras in the order of clearness, their offsets, and reasons."""
         late = np.zeros(self.count, dtype=np.int64)
         reasons = [
             "no offset stands out: its people move too little, or no other camera shows them"

@@ -24,10 +24,7 @@ from worldpose.video.pictures import FrameIndex, convert_pixels
 
 
 def join_videos(parts: Sequence[Path], out: Path) -> None:
-    """Write the chapters of one recording as one file, without re-encoding.
-
-    InputError for no video, chapters that differ, or a file that does not hold all frames.
-    """
+    """Write chapters of one recording as one file, not encoded again; InputError if they differ."""
     if parts[0].suffix.lower() == ".vob":  # parts of one stream, cut between any two packets
         index_frames(parts[0])  # what is wrong with all of them is said of a file of the user
         with out.open("wb") as whole:

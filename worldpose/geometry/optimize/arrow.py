@@ -58,10 +58,7 @@ class ArrowFactor:
 
     @classmethod
     def of(cls, system: ArrowSystem, damping: float = 0.0) -> ArrowFactor:
-        """Return the factor of a matrix whose diagonal is multiplied by 1 + damping.
-
-        It is invalid where `determined` is false.
-        """
+        """Return the factor with the diagonal times 1 + damping, invalid unless `determined`."""
         blocks, n = system.blocks.copy(), system.right.shape[1]
         blocks[0][:, range(n), range(n)] *= 1.0 + damping
         band = BandedFactor.of(blocks, overwrite=True)

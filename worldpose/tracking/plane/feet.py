@@ -114,10 +114,7 @@ class GroundPositions:
 
     @classmethod
     def join(cls, parts: Sequence[GroundPositions], length: int) -> GroundPositions:
-        """Return the frames of several parts of `length` frames, the last of which may be shorter.
-
-        Each part keeps its own number of detections.
-        """
+        """Return the frames of parts of `length` frames, each with its own number of detections."""
         names = set.intersection(*({*part.arrays()} for part in parts))
         return cls(
             **{name: FrameBlocks([getattr(p, name) for p in parts], length) for name in names}

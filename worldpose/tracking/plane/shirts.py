@@ -151,10 +151,7 @@ class ShirtModel:
         return cls(2.0 * np.maximum(spread, LEAST_STD), everyone[chosen])
 
     def same_person(self, memory: ShirtMemory | None, shirts: Floats) -> Floats:
-        """Return log odds (n,) that colours (n, 3) are those of a person and not of anyone.
-
-        Zero where the person's colour or the other one is not known.
-        """
+        """Return log odds (n,) that colours (n, 3) are a person's, not anyone's; 0 if unknown."""
         result = np.zeros(len(shirts))
         known = np.isfinite(shirts).all(axis=-1)
         colour = None if memory is None else memory.colour
