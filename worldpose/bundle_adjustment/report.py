@@ -133,10 +133,7 @@ class ClickReview:
 def keypoint_outliers(
     clip: Clip, cameras: Camera, noise: KeypointNoise, limit: float, longest: int
 ) -> KeypointOutliers:
-    """Return the keypoints that disagree with the joints from all cameras, the worst first.
-
-    They are those beyond a Mahalanobis distance; the list has a maximum length.
-    """
+    """Return keypoints beyond a Mahalanobis distance of all cameras' joints, the worst first."""
     block = 256  # frames at a time: limits the memory, not the result
     last = len(clip.frame)
 

@@ -278,7 +278,7 @@ def align(
     collinear points leave the rotation about their line open, and coinciding points give a
     translation (identity, scale 1). Without a common point the motion is NaN.
 
-    Both sets are (..., n, 3) [m], NaN where missing, or InputError; weights (..., n) are of pairs.
+    Sets are (..., n, 3) [m], NaN where missing, else InputError; weights (..., n) are of pairs.
     With scale it is a similarity (Procrustes analysis), else a rigid motion (Umeyama, IEEE PAMI
     13(4), 1991).
     """

@@ -86,12 +86,7 @@ def _check_size(content: Mapping[str, object], usual: PitchSpec, file: str) -> N
 
 
 def _check_points(points: object, pitch: PitchSpec, file: str) -> None:
-    """Raise InputError for surveyed points far from their places in the rules of the game.
-
-    Raises:
-        InputError: points are too far from there; the error names the point of the largest
-            distance.
-    """
+    """Raise InputError, naming the farthest one, for surveyed points far from their places."""
     from_laws = 2.0  # maximum distance of a surveyed point from its place in the rules, in plan [m]
     if not isinstance(points, dict):
         return  # the contract says what is wrong with them

@@ -82,10 +82,7 @@ def checked_arrays(
 
 
 def array_parts(array: ArrayLayout, shape: tuple[int, ...]) -> list[tuple[slice, ...]]:
-    """Return the slices of consecutive parts of an array of `shape`: one file each.
-
-    An array can be longer than memory, so it is processed one part at a time.
-    """
+    """Return the slices of an array's consecutive parts, one file each: it may exceed memory."""
     if 0 in shape:
         return []
     whole = tuple(slice(0, size) for size in shape)
