@@ -58,11 +58,8 @@ def pull(checkpoint: Checkpoint, folder: Path, progress: Progress) -> Path:
     """Download the missing files of a checkpoint, check them, and return its folder in the cache.
 
     What an interrupted pull has downloaded stays in a hidden folder, and the next pull resumes
-    there. A file with another digest is removed.
-
-    Raises:
-        InputError: an address is not https, or a file has another digest or size.
-        WorldposeError: the download failed, or another process pulls this checkpoint.
+    there. A file with another digest is removed. InputError if an address is not https, or a file
+    has another digest or size; WorldposeError if the download failed, or another process pulls it.
     """
     target = folder / checkpoint.name
     if read_pulled(checkpoint.name, folder) == checkpoint and not find_damage(target, checkpoint):
@@ -141,9 +138,7 @@ def _fetch_file(
 def resolve_address(url: str) -> str:
     """Return the http address of a file; HF_ENDPOINT names another hub than huggingface.co.
 
-    Raises:
-        UsageError: the address is neither https, http of this machine, nor hf: with a whole commit
-            id.
+    UsageError unless it is https, http of this machine, or hf: with a whole commit id.
     """
     found = HUB.fullmatch(url)
     if found is not None:

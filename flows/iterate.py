@@ -36,8 +36,7 @@ class Iteration:
     Attributes:
         number: iteration number, from 1.
         held_out_error: mean distance of keypoints in held-out cameras to the reprojection from the
-            others, all clips [box height]; None if it is undefined: only two cameras, or no
-            detections.
+            others, all clips [box height]; None with only two cameras, or no detections.
     """
 
     number: int
@@ -66,10 +65,7 @@ def iterate_match(store: Store, match: Match, request: RunRequest, most: int | N
     Existing results are not computed again; after a kill, the next call resumes from the finished
     results. If the match is edited between two iterations, all restart with the edit, so that all
     iterations use the same state of the match. None iterates until an iteration is no better than
-    the best before it.
-
-    Raises:
-        UsageError: only a part of the method was requested.
+    the best before it. UsageError if only a part of the method was requested.
     """
     require_whole(request)
     match, request = settle(store, match, request)

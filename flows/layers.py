@@ -44,12 +44,11 @@ ENVIRONMENT: Final = "environment"
 
 @dataclass(frozen=True)
 class Layer:
-    """One layer.
+    """One layer: values by name.
 
     Attributes:
         name: `project`, `venues/<name>`, `matches/<id>`, `environment`, or `match.yaml`.
         file: file or option that states it, for messages.
-        values: name to value.
         revision: digest of its file; empty without one.
     """
 
@@ -73,9 +72,7 @@ def match_layer(match_id: str) -> str:
 def read_layer(store: Store, name: str) -> Layer:
     """Return a layer of the store; empty if it has no file.
 
-    Raises:
-        InputError: the file is not a mapping of names to plain values, or states an invalid value
-            that is not of a stage.
+    InputError unless it maps names to plain values, those that are not of a stage being valid.
     """
     path = layer_path(name)
     file = f"{store.url}/{path}"
@@ -86,11 +83,7 @@ def read_layer(store: Store, name: str) -> Layer:
 
 
 def read_layers(store: Store, spec: MatchSpec) -> tuple[Layer, ...]:
-    """Return the layers of a match, the first with the least precedence.
-
-    Raises:
-        InputError: as `read_layer`.
-    """
+    """Return the layers of a match, the first with the least precedence; see `read_layer`."""
     own = read_layer(store, match_layer(spec.match_id))
     venue = own.values.get("venue", spec.venue)
     named = (
@@ -151,8 +144,7 @@ def merge_general(layers: Iterable[Layer]) -> RunSettings:
 def add_venue(folder: MatchFolder, layers: Iterable[Layer]) -> MatchFolder:
     """Return a match with the pitch, lenses and sides of its layers where it states none itself.
 
-    Raises:
-        InputError: a lens is of another image size than its camera.
+    InputError if a lens is of another image size than its camera.
     """
     found, spec = merge_general(layers), folder.spec
     if found.pitch is not None and spec.pitch is None and not pitch_file(folder.folder, spec):
@@ -256,11 +248,7 @@ def _parse(name: str, file: str, data: bytes) -> Mapping[str, JsonValue]:
 
 
 def check_general(name: str, file: str, values: Mapping[str, JsonValue]) -> None:
-    """Check the values of a layer that are not of a stage.
-
-    Raises:
-        InputError: a name is unknown, or a value is invalid.
-    """
+    """Raise InputError for an unknown name or invalid value in a layer that is not of a stage."""
     found = validate_record(RunSettings, _split_general(values), file)
     if found.venue is not None and not name.startswith(MATCHES):
         raise InputError(

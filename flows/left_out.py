@@ -21,10 +21,7 @@ from worldpose.store.store import Store
 def left_out_cameras(
     store: Store, match: Match, stages: tuple[Stage, ...], results: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return the static cameras that published results leave out, with reasons, in match order.
-
-    A result that is not published yet leaves out no camera.
-    """
+    """Return static cameras that published results leave out, with reasons, in match order."""
     judging = {stage.name for stage in stages if stage.leaves_out}
     said: dict[str, str] = {}
     for name, key in sorted(results.items()):

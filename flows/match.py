@@ -84,11 +84,9 @@ def process_match(
 
     The settings by stage are those that differ from their defaults, and the time limits of a unit
     by stage [min], too. The latest run supplies the results before `from_stage`, and the iterations
-    before this one have theirs. Without `gates`, no result needs review.
-
-    Raises:
-        IncompleteRunError: some units failed or need review; the others have their results.
-        LostWorkersError: the Prefect server or Dask scheduler is gone; another run resumes.
+    before this one have theirs. Without `gates`, no result needs review. IncompleteRunError if some
+    units failed or need review; LostWorkersError if the Prefect server or Dask scheduler is gone:
+    another run resumes.
     """
     logging.getLogger("worldpose").setLevel(logging.INFO)
     store = Store.open(project)
@@ -135,8 +133,7 @@ def compute(
 ) -> Iterator[tuple[PlannedUnit, BaseException | None]]:
     """Yield each unit when its task ends, with its exception if it failed.
 
-    Raises:
-        LostWorkersError: the Prefect server or Dask scheduler is gone.
+    LostWorkersError if the Prefect server or Dask scheduler is gone.
     """
     client = _client()
     with nullcontext() if client is None else on_workers_with(stage.worker_tag, client):

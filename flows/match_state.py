@@ -66,11 +66,7 @@ class MatchState:
 
 
 def match_state(store: Store, match: Match) -> MatchState:
-    """Return the state of a match.
-
-    Raises:
-        InputError: a setting of the latest run names a missing file.
-    """
+    """Return the state of a match; InputError if the latest run's settings name a missing file."""
     latest = latest_run(store, match.match_id)
     units: dict[UnitState, tuple[str, ...]] = {}
     plan: list[PlannedUnit] = []

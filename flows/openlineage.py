@@ -33,10 +33,7 @@ ANSWER_SECONDS: Final = 5.0
 
 
 def tell_lineage(store: Store, record: RunRecord) -> None:
-    """Send the events of a recorded run to OPENLINEAGE_URL, if it is set.
-
-    A failure is logged and stops nothing.
-    """
+    """Send the events of a recorded run to OPENLINEAGE_URL, if set; a failure is logged alone."""
     address = os.environ.get(URL)
     if not address:
         return

@@ -319,9 +319,7 @@ def code_digest() -> str:
 def _summarize(store: Store, draft: MatchSummary) -> MatchSummary:
     """Return a summary with what the match, its runs and its journal say.
 
-    Raises:
-        OSError: a file cannot be read.
-        WorldposeError: a record is damaged.
+    OSError if a file cannot be read, WorldposeError if a record is damaged.
     """
     match_id, latest = draft.match_id, latest_run(store, draft.match_id)
     last = "" if latest is None else latest.run_id

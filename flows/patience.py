@@ -73,12 +73,9 @@ def read_in_time(
 ) -> tuple[T, bool]:
     """Return what a read gives, or else the best that it has found, and whether its disk is silent.
 
-    Args:
-        place: what is read; only one read of it at a time is at work.
-        mark: of its state; a read that began before another one is not of this state.
-        read: gets a list to which it adds what it finds on the way.
-        first: what is known before.
-        is_patient: wait for a slow disk.
+    Only one read of a place is at work; one that began before another is not of its state, `mark`.
+    `read` gets a list to which it adds what it finds on the way, `first` is what is known before.
+    Who is patient waits for a slow disk.
     """
     with _LOCK:
         silent = sum(each.is_silent() for each in LATE.values())

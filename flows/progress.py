@@ -27,10 +27,7 @@ MOST_TOLD: Final = 200
 
 @dataclass(frozen=True)
 class Progress:
-    """How far something is.
-
-    The time left is None before anything is done [s].
-    """
+    """How far something is; the time left [s] is None before anything is done."""
 
     share: float
     seconds_left: float | None
@@ -79,10 +76,7 @@ class Reporter:
     """Time at which the stage began or a unit of it ended [s]."""
 
     def run_planned(self, work: Mapping[str, float]) -> None:
-        """Begin to measure a run.
-
-        `work` is the expected computation time of each stage's missing units, all workers [s].
-        """
+        """Begin to measure a run, by expected times of stages' missing units, all workers [s]."""
         self._work, self._reached, self._missing, self._began = dict(work), (), 0, None
 
     @property

@@ -140,10 +140,7 @@ def open_stored(store: Store, name: str) -> Match:
     """Open a registered match, given by folder or id, to show its results.
 
     If its folder is away, invalid or another match's now, the match is as the project knows it:
-    without images and clicks.
-
-    Raises:
-        InputError: there is no such match.
+    without images and clicks. InputError if there is no such match.
     """
     registration = find_registration(store, name)
     match_id = registration.spec.match_id

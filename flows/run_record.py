@@ -105,9 +105,7 @@ def alone_with(store: Store, match_id: str, *, wait: bool = False) -> Iterator[N
     """Hold a match, so that no other process of this machine runs it; or wait until none does.
 
     Every door that runs a match holds it, from before its settings are read to its record.
-
-    Raises:
-        AtWorkError: another process runs it, and this one does not wait, or has for `MOST_SECONDS`.
+    AtWorkError if another process runs it, and this one does not wait, or has for `MOST_SECONDS`.
     """
     said, begun = LOG.info, datetime.now(UTC)
     end = time.monotonic() + MOST_SECONDS

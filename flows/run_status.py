@@ -124,8 +124,7 @@ def plan_as_latest(
 ) -> list[PlannedUnit]:
     """Plan the whole method with the settings and the iteration of the latest run.
 
-    Raises:
-        InputError: a setting of that run names a missing file.
+    InputError if a setting of that run names a missing file.
     """
     found = resolve(match.layers, overrides)
     iteration = min(latest.iteration, last_iteration(latest, found)) if latest else 1
@@ -167,12 +166,10 @@ def recorded_recipe(store: Store, record: RunRecord, unit: str) -> Recipe | None
 
 @dataclass(frozen=True)
 class RunStatus:
-    """The stages that a match's latest run would recompute.
+    """The stages that a match's latest run would recompute, to its last one; None = the last.
 
-    Attributes:
-        until_stage: last stage of that run; None = the method's last.
-        units: units that differ from the run, in order.
-        is_stale: whether there is anything to do, even only to apply a verdict.
+    `units` differ from the run, in order; `is_stale` is whether there is anything to do, even only
+    to apply a verdict.
     """
 
     match: Match
@@ -196,10 +193,7 @@ def run_status(
 
     A failed unit with an unchanged recipe is skipped, and so are the units that depend on it,
     unless a disk or a network failed. `settings` go beyond those of the layers; `retry` retries all
-    failed units.
-
-    Raises:
-        InputError: the match folder is invalid.
+    failed units. InputError if the match folder is invalid.
     """
     latest = latest_run(store, match_id)
     if latest is None:

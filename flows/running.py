@@ -118,11 +118,8 @@ def settle(store: Store, match: Match, request: RunRequest) -> tuple[Match, RunR
 
     Every door calls this, and only this decides the settings of a run: a value is that of the last
     of the layers built in, project, venue and match which states it. What the request states
-    becomes the layer of the match, so that later runs keep it.
-
-    Raises:
-        InputError: a layer is invalid.
-        UsageError: the request is.
+    becomes the layer of the match, so that later runs keep it. InputError if a layer is invalid,
+    UsageError if the request is.
     """
     if request.is_settled:
         return match, request
@@ -230,12 +227,9 @@ def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
     """Run a match until its results are current; return the run's record.
 
     If nothing is stale, this is the latest run's record, and neither Prefect nor Dask starts; the
-    same holds if all runnable units wait for review.
-
-    Raises:
-        UsageError: an unknown stage, or no results to start `from_stage` from.
-        InputError: the given Dask scheduler or Prefect server does not answer.
-        LostWorkersError: the Prefect server or Dask scheduler stopped answering during the run.
+    same holds if all runnable units wait for review. UsageError for an unknown stage, or no results
+    to start `from_stage` from; InputError if the given Dask scheduler or Prefect server does not
+    answer; LostWorkersError if it stopped answering during the run.
     """
     stages = selected_stages(request.from_stage, request.until_stage)
     match, request = settle(store, match, request)

@@ -60,12 +60,11 @@ def _built_in() -> Mapping[str, JsonValue]:
 
 @dataclass(frozen=True)
 class ResolvedSettings:
-    """Settings of a match's next run.
+    """Settings of a match's next run, of which `general` are not of a stage.
 
     Attributes:
         values: name to value of everything that a layer states.
         origins: name to the layer that states the value.
-        general: the settings that are not of a stage.
     """
 
     values: Mapping[str, JsonValue]
@@ -91,11 +90,8 @@ def resolve(layers: Iterable[Layer], stated: Overrides | None = None) -> Resolve
     """Return the settings that layers, and over them a command line, give to a run.
 
     Every door (command, page, inbox, schedule, reprocess) and every question about a next run takes
-    its settings from here.
-
-    Raises:
-        InputError: a file states an unknown name or an invalid value, or a venue has no file.
-        UsageError: the command line does.
+    its settings from here. InputError if a file states an unknown name or an invalid value, or a
+    venue has no file; UsageError if the command line does.
     """
     command = Layer("command line", "--set", flatten(stated or {}))
     given = [*layers, command]
@@ -145,8 +141,7 @@ def save_layer(
 ) -> None:
     """Write a layer, if it is valid over those before it.
 
-    Raises:
-        InputError: a name is unknown, or a value is invalid; nothing is written.
+    InputError, and nothing is written, if a name is unknown, or a value is invalid.
     """
     layer = replace(read_layer(store, name), values=values, revision="new")
     check_general(name, layer.file, values)

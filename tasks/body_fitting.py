@@ -184,13 +184,11 @@ def _fitting_basis(
 
 @dataclass
 class FurtherArrays:
-    """Arrays of a result besides those of bodies.
+    """Arrays, also without frames, and attributes of a result besides those of bodies.
 
     Attributes:
         of_part: arrays of consecutive frames, given these, their bodies, and the evidence about
             them.
-        arrays: arrays without frames.
-        attributes: attributes of the group.
         known_shapes: shapes from other clips, by person index.
     """
 
@@ -213,10 +211,7 @@ def write_fit(
     """Fit the bodies of a clip in windows, and write them with their metrics.
 
     `fitting` is the unit of `body_fitting`, with settings, body model and pitch; `further` is what
-    a result has besides bodies.
-
-    Returns:
-        Shapes and offsets of the clip, without bodies of any frame.
+    a result has besides bodies. Return shapes and offsets of the clip, without bodies of any frame.
     """
     model, settings, ground = _fitting_basis(people, fitting)
     metrics = FitMetrics(people.fps, people.stride)
@@ -279,12 +274,7 @@ def frame_arrays(fit: BodyFit) -> dict[str, NDArray[Any]]:
 
 
 def find_same_body(inputs: UnitInputs) -> BodyModel:
-    """Return the body model of a unit.
-
-    Raises:
-        InputError: this worker has another file of that name.
-        UsageError: this worker has none.
-    """
+    """Return the body model of a unit; UsageError without one, InputError if it is another."""
     folder = None if inputs.work.body_folder is None else Path(inputs.work.body_folder)
     name = str(inputs.recipe.settings["body_model"])
     return find_body(name, folder, inputs.sources["body_model_sha256"])

@@ -86,10 +86,9 @@ def _read_people(
 ) -> tuple[NDArray[np.int64], NDArray[np.int16], Floats, NDArray[np.int64]]:
     """Read tracks and joints in the frames of all clips that were triangulated first.
 
-    Returns:
-        (persons,) ids, the same of which in two clips can be two people, and no code here
-        identifies them; their detections (frames, cameras, persons); their joints (frames, persons,
-        17, 3) [m], world; and views (frames, persons, 17).
+    Return ids (persons,), of which the same in two clips can be two people, and no code here
+    identifies them; detections (frames, cameras, persons); joints (frames, persons, 17, 3) [m],
+    world; and views (frames, persons, 17).
     """
     tracked = [
         select_triangulated(select_frames(inputs.open(f"tracking/{clip}"), found["frame"].values))

@@ -42,11 +42,7 @@ a third of it. Stages read a clip up to six times."""
 
 
 class PagedArray:
-    """An array that is read in pages, the last of which stay in memory.
-
-    Attributes:
-        shape: (frames, ...).
-    """
+    """An array of `shape` (frames, ...) that is read in pages, the last of which stay in memory."""
 
     def __init__(
         self,
@@ -218,10 +214,8 @@ def open_clip(
 ) -> ClipInputs:
     """Open the unit's clip; its detections are read on access.
 
-    Args:
-        inputs: the unit.
-        without: results of the previous iteration that do not apply, as in `StoredFeedback`.
-        further: changes of cameras within the clip besides those that earlier stages found.
+    `without` names results of the previous iteration that do not apply, as in `StoredFeedback`;
+    `further` are changes of cameras within the clip besides those that earlier stages found.
     """
     seen = inputs.sources["seen"]
     return _open_inputs(

@@ -172,11 +172,7 @@ def _pictures(inputs: UnitInputs) -> NDArray[np.integer]:
 
 
 def _given_people(inputs: UnitInputs) -> dict[int, People]:
-    """Return the given boxes of the clip's video by match frame.
-
-    Raises:
-        InputError: the file is invalid, or not the registered one.
-    """
+    """Return the clip's given boxes by match frame; InputError if the file has changed."""
     index = footage_index(inputs.open(f"ingest/{inputs.sources['camera']}"))
     given = read_boxes(inputs.file("boxes"), index.size, len(index))
     inputs.require_registered("boxes")

@@ -137,11 +137,7 @@ def filtering(inputs: UnitInputs, result: ResultWriter) -> None:
 
 
 class _Bodies:
-    """Fitted bodies of a clip, read by frames.
-
-    Attributes:
-        person: (persons,) ids.
-    """
+    """Fitted bodies of a clip, of ids `person` (persons,), read by frames."""
 
     def __init__(self, fitted: xr.Dataset, common_bias: Floats) -> None:
         self.person: NDArray[np.integer] = fitted["person"].values
@@ -154,10 +150,9 @@ class _Bodies:
     def read(self, frames: _Frames) -> tuple[Floats, Floats, Floats]:
         """Return joints, motion and covariance in some frames.
 
-        Returns:
-            Body joints by the detector's definition (frames, persons, 17, 3) [m], world; their
-            motion per frame (frames, persons, 17, 3) [m], NaN if unknown; the covariance of the
-            joints (frames, persons, 17, 3, 3) [m^2].
+        Body joints by the detector's definition (frames, persons, 17, 3) [m] are in the world.
+        Their motion per frame has that shape, NaN if unknown; the covariance is (frames, persons,
+        17, 3, 3) [m^2].
         """
         last = self._joints.shape[0] - 1
         rows = np.arange(last + 1)[frames]
@@ -238,8 +233,7 @@ def _counts(
 ) -> tuple[list[float], list[Floats]]:
     """Count keypoints tested and rejected; boxes dropped, reassigned, and newly assigned.
 
-    Returns:
-        These counts, and the keypoints rejected and given by camera.
+    Also return the keypoints rejected and given by camera.
     """
     frame, camera, person = np.nonzero(suspects.detections.detection_index >= 0)
     taken = np.full(judged.fits.shape, -1)

@@ -67,11 +67,7 @@ def proposal(inputs: UnitInputs, result: ResultWriter) -> None:
 def _find_camera(
     inputs: UnitInputs, pitch: PitchTemplate | None, settings: ProposalSettings
 ) -> tuple[Camera, Mapping[str, Any]]:
-    """Return the camera, and the stored attributes that tell how it was found.
-
-    Raises:
-        InputError: clicks or image do not determine it.
-    """
+    """Return the camera, and the stored attributes that tell how it was found, or InputError."""
     sources = inputs.sources
     if sources["calibration"] is not None:
         given = CameraCalibration.model_validate(sources["calibration"])

@@ -79,11 +79,7 @@ def static_calibration(inputs: UnitInputs, result: ResultWriter) -> None:
 
 
 def _calibrate(inputs: UnitInputs) -> StaticCalibration:
-    """Calibrate a camera from its clicks, or else from its proposal.
-
-    Raises:
-        InputError: they do not determine it.
-    """
+    """Calibrate a camera from its clicks, or else its proposal; InputError if undetermined."""
     sources, pitch = inputs.sources, inputs.pitch
     assert pitch is not None  # registration requires it
     picture, lens = open_still(inputs), given_lens(sources)
@@ -172,11 +168,7 @@ def clicked_markings(listed: Mapping[str, Any]) -> ClickedMarkings:
 
 
 def open_still(inputs: UnitInputs) -> NDArray[np.uint8] | None:
-    """Return the unit's still, or one without people from its video, from the files of its key.
-
-    Raises:
-        InputError: the file differs from the registered one, or is not an image.
-    """
+    """Return the unit's still, or one without people from its video; InputError if it changed."""
     sources = inputs.sources
     if sources["still"] is None:
         filmed = sources["filmed"]

@@ -332,11 +332,7 @@ def _estimate_clocks(
 def _track_on_plane(
     clip: ClipInputs, pitch: PitchTemplate, found: Identities, rates: Floats
 ) -> tuple[Identities, dict[str, float], str] | None:
-    """Add the people who are not triangulated, tracked by their feet.
-
-    Returns:
-        The people, metrics, and a sentence on clocks; None without any of them.
-    """
+    """Add people by their feet; return all, metrics and a sentence, or None without any."""
     is_triangulated = _mark(found.detection_index, clip)
     feet = _locate_feet(clip, pitch, ~is_triangulated)
     positions = feet.positions

@@ -133,11 +133,7 @@ class UnitInputs:
         return name in self.recipe.inputs
 
     def open(self, name: str) -> xr.Dataset:
-        """Open the input `stage/unit`; every byte is verified against its manifest on read.
-
-        Raises:
-            StoreError: the input is not published.
-        """
+        """Open the input `stage/unit`, or StoreError; each byte is verified by its manifest."""
         stage, _, unit = name.partition("/")
         return self.store.open_result(self.recipe.match_id, stage, unit, self.recipe.inputs[name])
 
@@ -160,12 +156,9 @@ class UnitInputs:
         return kind.model_validate(self.recipe.settings)
 
     def open_uncorrected(self, corrections: str) -> tuple[xr.Dataset, ResultManifest] | None:
-        """Return the published result of the same recipe without corrections; None without one.
+        """Return the published result of the same recipe without `corrections`; None without one.
 
-        A new computation would give the same bytes.
-
-        Args:
-            corrections: name of the source with people's corrections.
+        That source has people's corrections. A new computation would give the same bytes.
         """
         recipe = self.recipe
         sources = {name: each for name, each in recipe.sources.items() if name != corrections}

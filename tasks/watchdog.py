@@ -42,11 +42,8 @@ class WorkerCrashError(WorldposeError):
 def kill_on_timeout(work: Work) -> Iterator[None]:
     """End this worker if the block exceeds the time limit of the work.
 
-    Outside Dask workers there is no limit: the process belongs to the caller.
-
-    Raises:
-        TaskTimeoutError: the unit reached the maximum number of timeouts.
-        WorkerCrashError: the unit reached the maximum number of process deaths.
+    Outside Dask workers there is no limit: the process belongs to the caller. TaskTimeoutError or
+    WorkerCrashError if the unit reached the maximum number of timeouts, or of process deaths.
     """
     mark = _mark_of(work)
     if mark is None:

@@ -14,11 +14,9 @@ _PACKAGE = Path(__file__).resolve().parent
 
 
 class CacheFolder(NamedTuple):
-    """A folder that this process can write to.
+    """A folder that this process can write to; `path` is None if none is this user's alone.
 
-    Attributes:
-        path: the folder; None if there is none that only this user can write to.
-        is_lasting: whether it stays when the machine or container ends.
+    `is_lasting` is whether it stays when the machine or container ends.
     """
 
     path: Path | None

@@ -58,13 +58,9 @@ class UsageError(InputError):
 
 
 def unknown_name(where: str, name: str, known: Iterable[str], todo: str = "") -> UsageError:
-    """Return the error for a name that is none of the known ones.
+    """Return the error for a name of an option, `--clip second`, that is none of the known ones.
 
-    Args:
-        where: option with the name: `--clip second`.
-        name: the unknown name.
-        known: the known names.
-        todo: what the user can do; by default a similar name, if there is one.
+    `todo` is by default a similar name, if there is one.
     """
     names = list(known)
     close = get_close_matches(name, names, n=1)
@@ -116,15 +112,7 @@ class MemoryLimitError(WorldposeError):
 
 
 def require_memory(failure: BaseException, where: str = "") -> None:
-    """Raise an error if a failure means too little memory; otherwise return.
-
-    Args:
-        failure: the exception.
-        where: the running code, for the message.
-
-    Raises:
-        MemoryLimitError: the failure means too little memory.
-    """
+    """Raise MemoryLimitError if a failure of the running code `where` means too little memory."""
     is_thread = isinstance(failure, RuntimeError) and "start new thread" in str(failure)
     is_refused = isinstance(failure, OSError) and failure.errno == errno.ENOMEM
     if isinstance(failure, MemoryError) or is_thread or is_refused:

@@ -66,8 +66,7 @@ def parse_in_turn(parse: Callable[[], Result]) -> Result:
 def read_npy_header(stream: IO[bytes]) -> Header:
     """Return the header of the npy array at the start of a stream; the array's bytes follow.
 
-    Raises:
-        ValueError: this is no npy array of version 1.0, or one of records.
+    ValueError if this is no npy array of version 1.0, or one of records.
     """
     if npy.read_magic(stream) != (1, 0):
         raise ValueError("another version than npy 1.0")  # later ones allow headers of 4 GB
@@ -90,8 +89,7 @@ def read_npy_header(stream: IO[bytes]) -> Header:
 def read_npy(stream: IO[bytes]) -> NDArray[np.generic]:
     """Return the npy array at the start of a stream; Python objects are refused unread.
 
-    Raises:
-        ValueError: this is no npy array of plain values, or it is truncated.
+    ValueError if this is no npy array of plain values, or it is truncated.
     """
     block_bytes = 1 << 18  # bytes read at a time: an unpacked block fits into a processor's cache
     shape, is_fortran, dtype = read_npy_header(stream)
@@ -110,9 +108,7 @@ def read_npy(stream: IO[bytes]) -> NDArray[np.generic]:
 def read_npz_members(path: Path, names: Collection[str]) -> dict[str, NDArray[Any]]:
     """Return those arrays of an npz file that are among `names`; others are not read.
 
-    Raises:
-        ValueError: an array is damaged or holds Python objects.
-        zipfile.BadZipFile: the file is no npz file, or damaged.
+    ValueError if one is damaged or holds Python objects, zipfile.BadZipFile if the file is.
     """
     with zipfile.ZipFile(path) as file:
         found = {info.filename.removesuffix(".npy"): info for info in file.infolist()}
@@ -155,14 +151,7 @@ def read_cells(path: Path, limit: int, todo: str) -> tuple[list[tuple[int, list[
 
     Text is UTF-8, UTF-16 with its mark, or Windows-1252; cells are separated by commas, semicolons
     or tabs. Rows are numbered from 1; empty ones, and empty columns at the end, are left out.
-
-    Args:
-        path: the file.
-        limit: maximum size [byte].
-        todo: what to do about another file, for messages.
-
-    Raises:
-        InputError: no such file, too large, a workbook in place of text, or no table.
+    InputError, with `todo`, for more than `limit` bytes, a workbook in place of text, or no table.
     """
     try:
         if not path.is_file():

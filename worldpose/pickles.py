@@ -286,12 +286,9 @@ def read_pickle(path: Path) -> Any:  # noqa: ANN401
     """Return the content of a file: dictionaries, lists, numbers, text, bytes and arrays.
 
     Pickles, also gzipped or of joblib (plain or zlib), numpy's `.npy` and torch's `.pt` are
-    recognised by their bytes. A tuple becomes a list, and an object of another kind None.
-
-    Raises:
-        OSError: the file cannot be read.
-        ValueError: the file is damaged, too large, contains itself, or names a class that is not
-            allowed.
+    recognised by their bytes. A tuple becomes a list, and an object of another kind None. OSError
+    if the file cannot be read; ValueError if it is damaged, too large, contains itself, or names a
+    class that is not allowed.
     """
     try:
         if zipfile.is_zipfile(path):
@@ -312,10 +309,8 @@ _OPEN: Final = object()
 def _plain(value: Any, done: dict[int, tuple[Any, Any]]) -> Any:  # noqa: ANN401
     """Return a value without objects of this module.
 
-    Args:
-        value: any content of a pickle.
-        done: the objects that were converted, and their conversions, by identity: nested sharing
-            would otherwise grow without bound.
+    `done` are the converted objects and their conversions, by identity: nested sharing would
+    otherwise grow without bound.
     """
     if isinstance(value, bool | int | float | str | bytes | np.ndarray):
         return value

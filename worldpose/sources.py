@@ -51,12 +51,7 @@ class SourceCache:
         self._is_changed = False
 
     def parse(self, name: str, source: bytes) -> ParsedSource:
-        """Return the properties of module `name` with this source.
-
-        Raises:
-            SyntaxError: the source is not valid Python.
-            ValueError: the source contains a zero byte.
-        """
+        """Return the properties of module `name` with this source; errors as of `parse_source`."""
         identity = _digest(source)
         kept = self._modules.get(name)
         if kept is None or kept[0] != identity:
@@ -114,12 +109,7 @@ def _digest(data: bytes) -> str:
 
 
 def parse_source(source: bytes) -> ParsedSource:
-    """Return the properties of a source.
-
-    Raises:
-        SyntaxError: the source is not valid Python.
-        ValueError: the source contains a zero byte.
-    """
+    """Return the properties of a source; SyntaxError or ValueError if it is not Python."""
     tree = parse_in_turn(lambda: ast.parse(source))
     nodes = _drop_text(tree)
     texts = {node.value for node in nodes if isinstance(node, ast.Constant)}

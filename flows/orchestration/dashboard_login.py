@@ -38,14 +38,10 @@ CHECK_SECONDS: Final = 1.0
 class DashboardLogin:
     """ASGI middleware that gives Prefect's login to requests with the session of an approver.
 
-    Prefect checks the login as before. A session counts only for requests of this server's own
-    pages, which the host guard around this one has told from foreign ones; a change must state its
-    origin. Clients with the login pass unchanged. A browser without either gets the pages' form.
-
-    Args:
-        app: Prefect's server.
-        access: that of the pages.
-        login: Prefect's, as USER:PASSWORD.
+    Prefect checks the login, USER:PASSWORD, as before. A session of the pages counts only for
+    requests of this server's own pages, which the host guard around this one has told from foreign
+    ones; a change must state its origin. Clients with the login pass unchanged. A browser without
+    either gets the pages' form.
     """
 
     def __init__(self, app: ASGIApp, access: Access, login: str) -> None:

@@ -83,11 +83,7 @@ def short_seconds(unit: PlannedUnit) -> float:
 
 
 def wait_for_worker(cluster: PrivateCluster) -> None:
-    """Return when the first worker has started.
-
-    Raises:
-        WorldposeError: none did in time.
-    """
+    """Return when the first worker has started; WorldposeError if none did in time."""
     try:
         cluster.wait_for_workers(1, START_SECONDS)
     except TimeoutError:
@@ -134,10 +130,7 @@ class LostWorkersError(WorldposeError):
 def require_room(failure: BaseException, project: str) -> None:
     """Raise StoreError if a failure of Prefect was caused by a full disk; else return.
 
-    Prefect reports database failures only as `500`. Its database is in a temporary folder.
-
-    Raises:
-        StoreError: the disk of the store or of Prefect's database is full.
+    Prefect reports failures of its database, in a temporary folder, only as `500`.
     """
     if isinstance(failure, StoreError):
         return
@@ -156,8 +149,7 @@ def require_room(failure: BaseException, project: str) -> None:
 def require_workers(failure: BaseException) -> None:
     """Raise LostWorkersError if a unit failed because its machines are gone; else return.
 
-    Raises:
-        LostWorkersError: the run's machines are gone; its other units would fail too.
+    Other units of the run would fail too.
     """
     # Imported here: only runs that compute need them.
     import httpx

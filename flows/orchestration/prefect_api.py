@@ -44,11 +44,7 @@ class PrefectApi:
     tries: int = 4
 
     def ask(self, path: str, body: Any = None, *, method: str | None = None) -> Any:  # noqa: ANN401
-        """Send a request, by default a POST if there is a body; return the answer's JSON.
-
-        Raises:
-            UnreachablePrefectError: the server does not answer, or refuses.
-        """
+        """Send a request, a POST if it has a body; UnreachablePrefectError without an answer."""
         headers = {}
         key = os.environ.get(CLOUD_LOGIN)
         if self.login:

@@ -202,10 +202,8 @@ def prefect_server(*, is_local: bool = False) -> Iterator[Callable[[], None]]:
 
     Prefect, which takes seconds to import, can then be imported while its server starts. The
     function raises WorldposeError if our own server does not answer. Its database lasts as long as
-    it does. `is_local` says that all its clients see this machine's files.
-
-    Raises:
-        InputError: a given server does not answer.
+    it does. `is_local` says that all its clients see this machine's files. InputError if a given
+    server does not answer.
     """
     given = {name: os.environ.get(name, value) for name, value in UNLESS_GIVEN.items()}
     with _environment({**ALWAYS, **given, **_without_proxy()}):
@@ -302,11 +300,7 @@ def _require_answer(address: str) -> None:
 
 
 def require_login(address: str) -> None:
-    """Check that a Prefect server accepts this process's login.
-
-    Raises:
-        InputError: the server requires another login.
-    """
+    """Raise InputError if a Prefect server requires another login than this process has."""
     login, key = os.environ.get(CLIENT_LOGIN), os.environ.get(CLOUD_LOGIN)
     headers = {"authorization": f"Bearer {key}"} if key else {}
     if login:
@@ -357,13 +351,8 @@ def begin_database(home: Path) -> bool:
 
     Prefect creates one with a hundred migrations, which takes as long as the rest of its start. The
     first one of a version is kept in the user's cache. Its files are for this account alone: SQLite
-    gives the rights of the database to its log.
-
-    Returns:
-        Whether the server must create the first one of its version there, to be kept then.
-
-    Raises:
-        StoreError: `home` is not writable.
+    gives the rights of the database to its log. Return whether the server must create the first one
+    of its version there, to be kept then; StoreError if `home` is not writable.
     """
     # Imported here and below: with them, the server's process would import numba and scipy.
     from worldpose.formats.files import whole_file

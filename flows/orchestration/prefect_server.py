@@ -48,10 +48,7 @@ def guarded_app(
     """Create Prefect's API, and its dashboard unless embedded, for requests that name this server.
 
     An embedded one lasts as long as one run. Loopback's names need not be given. With `access`, a
-    session of the pages opens it, too.
-
-    Raises:
-        UsageError: the environment has no login for it.
+    session of the pages opens it, too; UsageError if the environment has no login for it.
     """
     if not os.environ.get(SERVER_LOGIN):
         raise UsageError(
@@ -110,12 +107,9 @@ class RepeatBusy:
     """ASGI middleware that repeats changes that Prefect refuses because its database is busy.
 
     SQLite has one writer. A transaction that reads and then writes fails at once if another one
-    wrote in between, and Prefect then answers 503. Its dashboard reports that as an error, and the
-    run or schedule that a person submitted does not exist.
-
-    Args:
-        app: Prefect's server, which has undone all that a refused request had written.
-        pause_s: pause before each repetition [s].
+    wrote in between, and Prefect then undoes it and answers 503. Its dashboard reports that as an
+    error, and the run or schedule that a person submitted does not exist. `pause_s` is before each
+    repetition [s].
     """
 
     def __init__(self, app: ASGIApp, pause_s: float = PAUSE_SECONDS) -> None:

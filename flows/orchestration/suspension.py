@@ -49,11 +49,8 @@ def take_verdict(store: Store, match_id: str, waiting: Sequence[WaitingUnit]) ->
 
     Prefect identifies the question by a key derived from the waiting results: after a resume the
     same key returns the answer, and other results form another question. The waiting units are in
-    the journal already.
-
-    Raises:
-        WorldposeError: resumed with `recorded` though nothing was decided.
-        prefect.exceptions.Pause: not answered yet; this ends the process.
+    the journal already. WorldposeError if it is resumed with `recorded` though nothing was decided;
+    prefect.exceptions.Pause, which ends the process, if it is not answered yet.
     """
     asked = sorted(unit.request for unit in waiting)
     lines = [f"- `{unit.request}`: {all_reasons(unit.reasons)}" for unit in waiting]
@@ -95,8 +92,7 @@ def take_verdict(store: Store, match_id: str, waiting: Sequence[WaitingUnit]) ->
 def resume_suspended(project: str, match_id: str) -> list[str]:
     """Resume the suspended runs of a match after its reviews are decided; return their names.
 
-    Raises:
-        WorldposeError: Prefect does not answer, or refuses.
+    WorldposeError if Prefect does not answer, or refuses.
     """
     api = os.environ["PREFECT_API_URL"].rstrip("/")
     prefect, deadline = PrefectApi(api, os.environ.get(CLIENT_LOGIN)), time.monotonic() + SUSPENDING

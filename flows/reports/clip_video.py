@@ -63,11 +63,8 @@ def write_clip_video(
 ) -> None:
     """Write the video (mp4) of a clip with markings and people overlaid.
 
-    The owner is a camera as `static_view` returns it; None = that of `clip_view`, which has one.
-    A long clip is cut to its middle part.
-
-    Raises:
-        InputError: an image is damaged.
+    The owner is a camera as `static_view` returns it; None = that of `clip_view`, which has one. A
+    long clip is cut to its middle part. InputError if an image is damaged.
     """
     owner = owner or clip_view(run, match, clip)
     assert owner is not None  # the caller checks that there is one

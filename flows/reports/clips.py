@@ -188,10 +188,7 @@ def worst_views(run: Run, match: Match, clip: str, tracks: JointTracks) -> list[
     """Return views with the largest median distance of keypoints to projected joints, worst first.
 
     Distances are in heights of the person in the image, over the keypoints assigned to the person's
-    track; each person appears once.
-
-    Returns:
-        Frame index, camera and person of each, and the median distance in percent.
+    track; each person appears once. A view is frame index, camera, person, and distance in percent.
     """
     rows = sample_evenly(len(tracks.frames), EVALUATED_FRAMES)
     numbers = tracks.frames[rows]

@@ -27,10 +27,7 @@ def background_image(store: Store, match: Match, camera_id: str) -> Image | None
 
     It is the still of the match folder or, without one, the first readable image of the camera's
     video in the clips; None if the match has neither. The latest run of the store maps match frames
-    to video frames; here and below.
-
-    Raises:
-        InputError: the still or an image of the video is damaged.
+    to video frames; here and below. InputError if the image is damaged.
     """
     still = match.folder.stills.get(camera_id)
     if still is not None:
@@ -55,11 +52,7 @@ def frame_picture(store: Store, match: Match, owner: str, frame: int) -> Image |
 def frame_pictures(
     store: Store, match: Match, owner: str, frames: Sequence[int]
 ) -> Iterator[Image | None]:
-    """Yield the images of ascending match frames, decoded once and in order.
-
-    Raises:
-        InputError: an image is damaged.
-    """
+    """Yield images of ascending match frames, decoded once in order; InputError if damaged."""
     file = match.folder.videos.get(owner)
     if file is None or not file.exists():  # results outlive their videos
         yield from (None for _ in frames)

@@ -72,9 +72,7 @@ def write_report(
     The reference is ground truth; None = `reference/` of the match folder, if it exists. Videos are
     each clip's broadcast video, and that of a static camera (None = the one with most people), with
     the results overlaid. `figures` is a folder for the page's figures as SVG, PDF and JSON.
-
-    Returns:
-        The videos written next to it; and why a reference is not scored, empty if it is.
+    Returned are the videos written next to it; and why a reference is not scored, empty if it is.
     """
     if out.is_dir():
         todo = f"Name a file in it, as in --out {out / 'report.html'}."

@@ -39,10 +39,8 @@ REPORT_POSES: Final = 100_000
 def report_viewer(run: Run, match: Match) -> tuple[tuple[EmbeddedPage, ...], str]:
     """Return the 3D view of a run's clips for its report, and what the view leaves out.
 
-    The view has the clips in their order, until there are `REPORT_POSES` people times frames.
-
-    Returns:
-        The page, or nothing if there is nobody to show; and a sentence, empty if all is shown.
+    The view has the clips in their order, until there are `REPORT_POSES` people times frames. There
+    is no page if there is nobody to show, and the sentence is empty if all is shown.
     """
     origin, spare, clips, all_frames = Origin(run, match.registration), REPORT_POSES, [], 0
     for name in find_clips(run.record):
@@ -72,9 +70,8 @@ def _viewer_page() -> str:
 def write_viewers(origin: Origin, out: Path) -> list[Path]:
     """Write `viewer/<clip>.html`; or the file `out` with all clips, if its name ends with .html.
 
-    Raises:
-        UsageError: a video is asked for, and no camera of a clip has one.
-        InputError: there is nobody to show.
+    UsageError if a video is asked for, and no camera of a clip has one; InputError if nobody is
+    there.
     """
     page, (store, match) = _viewer_page(), origin.footage or (None, None)
     written: dict[Path, tuple[str, ...]] = {

@@ -126,10 +126,7 @@ def trial(seed: int, clicks: ClickSettings | None) -> dict[str, Score]:
     the whole lens and drops the camera priors, as is common practice; the rows `unguarded` show its
     result without held-out validation. Every row is triangulated from the same tracks; the last one
     fits bodies to our triangulation after adjustment. Rows that end with `BY_PAPER` are the four of
-    the paper by its own method.
-
-    Note:
-        Paper, table of the Vicon trial.
+    the paper by its own method (table of the Vicon trial).
     """
     scene = simulate(seed, clicks)
     pitch = PitchTemplate.from_spec(scene.surveyed)

@@ -36,21 +36,15 @@ def score_methods(
     fps: float | None = None,
     seen_fps: Mapping[str, float] | None = None,
 ) -> tuple[MethodScore, ...]:
-    """Score results of baseline methods; return each score with its settings.
+    """Score results, NAME=PATH, of baseline methods; return each score with its settings.
 
-    Args:
-        named: NAME=PATH of each result.
-        reference: ground truth, as for `worldpose evaluate`.
-        match_in: reference camera in whose image tracks are matched.
-        body: body model that poses are applied to; None = the open body.
-        first_frame: match frame of the methods' first image; None = the reference's first.
-        fps: frames per second; None = those that the reference states.
-        seen_fps: name of a method to the frames per second of its input video, if not the clip's;
-            the result is resampled to the clip's frames.
+    The reference is as for `worldpose evaluate`; tracks are matched in the image of its camera
+    `match_in`. `body` is the model of poses, None = the open body. `first_frame` is the match frame
+    of the methods' first image, None = the reference's. `fps` None is what the reference states;
+    `seen_fps` has that of a method's input video, if not the clip's, to whose frames it is
+    resampled.
 
-    Raises:
-        UsageError: an unknown method, an unknown camera, or a method that needs `match_in`.
-        InputError: a file is not in the method's format.
+    UsageError for an unknown method or camera, or a method that needs `match_in`.
     """
     settings = EvaluationSettings()
     truth = reference_side(reference)

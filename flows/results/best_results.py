@@ -96,11 +96,8 @@ RUN_ENDS: Final[Mapping[RunState, str]] = {
 def open_results(store: Store, match_id: str, run_id: str = LATEST) -> Run:
     """Open a run; for `latest`, the latest run with people, in 3D or on the pitch.
 
-    A run that waits for review or failed comes after all others, which can have more results. If
-    no run has people, `latest` is the latest run.
-
-    Raises:
-        InputError: there is no such run.
+    A run that waits for review or failed comes after all others, which can have more results. If no
+    run has people, `latest` is the latest run. InputError if there is no such run.
     """
     fallback = None
     for number in reversed(store.runs(match_id)) if run_id == LATEST else ():
@@ -334,9 +331,7 @@ def bodies_unit(run: Run, clip: str) -> str:
 def fitted_model(run: Run, unit: str) -> BodyModel:
     """Return the body model of a result `stage/unit`, from the folder that the run was given.
 
-    Raises:
-        UsageError: no body of that name is installed there.
-        InputError: the installed body is not the one that was fitted.
+    UsageError if none of that name is installed there, InputError if it is not the one fitted.
     """
     name, folder = run[unit].attrs["body_model"], run.record.body_folder
     fitted = {} if is_open_body(name) else run.manifest(unit).recipe.sources
@@ -414,8 +409,7 @@ def fitted_bodies(
 ) -> tuple[BodyModel, BodyParameters, NDArray[np.int32], Integers]:
     """Return body model, poses (persons, frames), person ids, and match frames of a clip's fits.
 
-    Raises:
-        InputError: the run has no fitted bodies.
+    InputError if the run has no fitted bodies.
     """
     unit = require_result(run, bodies_unit(run, clip), "Run the match to the end first.")
     fits = run[unit]

@@ -103,11 +103,8 @@ def find_offsets(run: Run, match: Match, clip: str | None, max_offset_s: float) 
     """Find the clock offsets of static cameras in a clip, or else in the longest.
 
     The cameras of the run are calibrated, and it has 2D poses; `max_offset_s` is the largest offset
-    between two cameras [s].
-
-    Raises:
-        InputError: fewer than two cameras have a calibration and 2D poses.
-        UsageError: the match has no such clip.
+    between two cameras [s]. InputError if fewer than two cameras have a calibration and 2D poses,
+    UsageError if the match has no such clip.
     """
     spec, pitch = match.folder.spec, match.folder.pitch
     clip = choose_clip(spec, clip)

@@ -189,10 +189,8 @@ class BodiesOfBoth:
 
     Attributes:
         frame: (frames,) match frames.
-        person_before: (persons,) ids in A.
-        person_after: (others,) ids in B.
-        before: (frames, persons, 17, 3) [m], world, of A.
-        after: (frames, others, 17, 3) [m], world, of B.
+        person_before: (persons,) ids in A; person_after: (others,) ids in B.
+        before: (frames, persons, 17, 3) [m], world, of A; after: (frames, others, 17, 3), of B.
     """
 
     clip: str

@@ -280,10 +280,7 @@ def _count_public(
 def check_data_set(folder: Path, hidden: Path | None = None) -> contracts.CheckReport:
     """Verify what release.json states: files, splits, licences, numbers, and 3D against boxes.
 
-    Without `hidden`, the truth of the test part is not verified.
-
-    Raises:
-        InputError: there is no such data set.
+    Without `hidden`, the truth of the test part is not verified. InputError without a data set.
     """
     manifest = manifests.read_data_set(folder)
     findings = [*_file_findings(folder, hidden, manifest), *_statement_findings(manifest)]

@@ -29,11 +29,7 @@ USUAL_FPS = 50.0
 
 
 def stated_rates(folder: Path, fps: float | None = None) -> dict[str, float | None]:
-    """Return the frames per second of each clip of a data set; None where it is not stated.
-
-    Raises:
-        InputError: a file cannot be read.
-    """
+    """Return the frames per second of each clip of a data set; None where it is not stated."""
     return {clip: fps or stated_rate(folder, clip) for clip in list_clips(folder)}
 
 
@@ -52,9 +48,7 @@ def check(
     one that the data set states, or 50 per second; `body` is the model of pose files that name
     none, and `models` has bodies, by name, that may not be installed. `pitch` says whether the
     ground is z = 0; a manifest can state otherwise. `only` is the clip to check; None = all.
-
-    Raises:
-        InputError: a file cannot be read.
+    InputError if a file cannot be read.
     """
     manifest = read_manifest(folder)
     findings, notes = list[Finding](), list[str]()
@@ -101,11 +95,7 @@ def count(folders: Sequence[Path], *, fps: float | None = None) -> DataSetStatis
     """Count the content of one data set, which can span several folders.
 
     One clip is in memory at a time. Without `fps` the rate is the one that the data sets state, or
-    50 per second.
-
-    Raises:
-        InputError: a file cannot be read.
-        UsageError: two folders have the same name and clips.
+    50 per second. UsageError if two folders have the same name and clips.
     """
     clips = {}
     for folder in folders:

@@ -93,22 +93,15 @@ def score(
 ) -> Scores:
     """Compute every score for which both prediction and reference have data.
 
-    Args:
-        prediction: a joints file, a folder with `joints.npz` and `cameras/`, or a match.
-        reference: a joints file, a folder with `joints.npz`, `cameras/` or both, a C3D or TRC
-            file of markers, which is aligned with the prediction in time and space, or a CSV of
-            positions, with which people are compared on the ground.
-        project: project with the runs of matches.
-        run_id: the match's run as for `open_results`; only if `prediction` is a match.
-        stage: stage whose joints are scored if `prediction` is a match; None = the last one with
-            joints.
-        fps: frames per second; None = those that a side states.
-        match_in: reference camera in whose image tracks are matched.
-        reading: how the reference's file is read.
+    The prediction is a joints file, a folder with `joints.npz` and `cameras/`, or a match. Of a
+    match's run, as for `open_results`, `stage` has the joints; None = the last one with any. The
+    reference is such a file or folder, or a C3D or TRC file of markers, which is aligned with the
+    prediction in time and space. It may be a CSV of positions, with which people are compared on
+    the ground. `reading` says how its file is read; tracks are matched in the image of its camera
+    `match_in`.
 
-    Raises:
-        UsageError: an unknown name, or no data that both sides have.
-        InputError: a file has the wrong format.
+    `fps` None is what a side states. UsageError for an unknown name, or no data that both sides
+    have.
     """
     suffix, notes = Path(reference).suffix.lower(), list[str]()
     measured, placed = suffix in SUFFIXES, suffix in TABLES
@@ -195,11 +188,7 @@ def _align_markers(
 
 
 def reference_side(name: str) -> Side:
-    """Load the data of a ground truth file or folder, and the match next to it.
-
-    Raises:
-        InputError: there is no such file, or it has the wrong format.
-    """
+    """Load the data of a ground truth file or folder, and the match next to it, or InputError."""
     path = Path(name)
     match = None
     if around := spec_around(path):  # without its videos, which may be gone

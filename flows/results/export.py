@@ -62,9 +62,7 @@ def export_worldpose(origin: best_results.Origin, out: Path) -> Iterator[Path]:
     A clip without people has cameras alone. A moving camera of another frame rate than the match is
     left out. Other lenses than Brown's are fitted by it; `lens_errors.json` states the errors of
     `fit_brown_lens`, and `camera_changes/<clip>.json` how static cameras change within a clip.
-
-    Raises:
-        InputError: a clip has people and no bodies, or Brown's model does not follow a lens.
+    InputError if a clip has people and no bodies, or Brown's model does not follow a lens.
     """
     with_people = best_results.find_clips(origin.run.record)
     rates = (unit_frames(origin.spec, view).rate for view in broadcast_views(origin.run))
@@ -157,8 +155,7 @@ def _by_given_rows(
 def _filmed(origin: best_results.Origin) -> dict[str, tuple[str, Camera]]:
     """Return the clip and the moving camera of every broadcast view.
 
-    Raises:
-        InputError: a clip has no fitted bodies or no such camera, or one of another frame rate.
+    InputError if a clip has no fitted bodies or no such camera, or one of another frame rate.
     """
     found: dict[str, tuple[str, Camera]] = {}
     for clip in origin.clips:
@@ -381,8 +378,7 @@ def _export(origin: best_results.Origin, forms: list[str], out: Path) -> list[Pa
 def keep_run(store: Store, origin: best_results.Origin, name: str) -> bool:
     """Pin the run of a release, never to be garbage collected; return whether the pin is new.
 
-    Raises:
-        InputError: a pin cannot have this name, or another run of the match has it.
+    InputError if a pin cannot have this name, or another run of the match has it.
     """
     record = origin.run.record
     new = read_pin(store.blobs, record.match_id, f"release-{name}") is None
@@ -403,12 +399,9 @@ def release(
 ) -> list[Path]:
     """Write a release: the formats, origins/<clip>.npz and manifest.json; return the files.
 
-    A release is frozen: its folder accepts only the same release again. Its run is pinned.
-
-    Raises:
-        UsageError: the folder holds another release.
-        InputError: another run of the match was released under this name, or the folder cannot be
-            written.
+    A release is frozen: its folder accepts only the same release again, or UsageError. Its run is
+    pinned. InputError if another run of the match was released under this name, or the folder
+    cannot be written.
     """
     if out.suffix == VIEWER_SUFFIX:
         raise _file_for_folder(out, forms)

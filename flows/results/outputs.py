@@ -127,8 +127,7 @@ def record_owner(
 def claim_file(file: Path | None, owner: str) -> None:
     """Record the owner of a file that a command writes next; without a file do nothing.
 
-    Raises:
-        InputError: the file exists and has another owner.
+    InputError if the file exists and has another owner.
     """
     if file is not None:
         require_own(file.parent, {file.name: None}, (owner,), overwrite=False)

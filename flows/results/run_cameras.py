@@ -95,8 +95,7 @@ def with_brown_lenses(
 ) -> tuple[dict[str, Camera], dict[str, dict[str, str | float | None]]]:
     """Return cameras with Brown's lenses, and the errors of those that had another, by id.
 
-    Raises:
-        InputError: Brown's model does not follow a lens; `where` tells what is written.
+    InputError, with `where` as what is written, if Brown's model does not follow a lens.
     """
     found, errors = dict(cameras), dict[str, dict[str, str | float | None]]()
     for name, camera in cameras.items():

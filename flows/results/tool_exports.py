@@ -188,10 +188,7 @@ def filmed_cameras(
     """Return the moving cameras of a clip in the frames of its bodies, (frames,), by view.
 
     They are for formats whose rows are images. With `leave_out`, a warning names the cameras of
-    another frame rate, which are left out.
-
-    Raises:
-        InputError: the run has no such camera, or one of another frame rate than the match.
+    another frame rate, which are left out; else they are an InputError, as is no camera.
     """
     run, found = origin.run, {}
     todo = "Calibrate the clip's broadcast camera and run the match again. A match with static "

@@ -47,11 +47,8 @@ def export_people(
     """Write detections and images for an annotation tool.
 
     Each place is a camera, or the clip of a broadcast camera, and a match frame. The folder is
-    absent or empty; it receives labels.json or labels.xml, pictures/ and exported.json.
-
-    Raises:
-        UsageError: the folder is not empty.
-        InputError: the latest run has no detections there, or an image is damaged.
+    absent or empty, or UsageError; it receives labels.json or labels.xml, pictures/ and
+    exported.json. InputError if the latest run has no detections there, or an image is damaged.
     """
     if folder.exists() and any(folder.iterdir()):
         raise UsageError(
@@ -90,10 +87,8 @@ def import_people(
     """Import an annotation tool's changes as corrections, all or none; a repeated import adds none.
 
     `exported` is the record of the export; without a format, the content of the file tells it.
-
-    Raises:
-        StaleEditError: another person corrected the same detection in between.
-        InputError: a file has the wrong format, or a change does not apply; no change is kept.
+    StaleEditError if another person corrected the same detection in between, InputError if a change
+    does not apply; no change is kept then.
     """
     changes = find_changes(
         read_annotations(exported, "coco"), read_annotations(file, form), str(file)

@@ -126,12 +126,9 @@ def new_corrections(
     """Turn edits, in the order of application, into corrections, each based on those before it.
 
     The match is as it was opened, the journal as it is now; `results` are those that the reviewer
-    saw. `ids` has one id per edit; empty = new ids.
-
-    Raises:
-        StaleEditError: the edited value differs from the edit's `was`, or from the results.
-        InputError: an edit does not apply, because of its target or because of another person's
-            edit in between; no edit is kept.
+    saw. `ids` has one id per edit; empty = new ids. StaleEditError if the edited value differs from
+    the edit's `was`, or from the results; InputError if an edit does not apply, because of its
+    target or of another person's edit in between. No edit is kept then.
     """
     standing = tuple(journal.standing.values())
     if standing != tuple(match.journal.standing.values()):
@@ -179,11 +176,8 @@ def keep_edits(
     """Record edits as corrections in the journal, all or none; durable on return.
 
     `open_match` returns the match with its current journal; `given` has the edits by id in the
-    order of application. An id that is already recorded counts as resent, and is kept once.
-
-    Raises:
-        StaleEditError: the edited value differs from the edit's `was`.
-        InputError: an edit does not apply.
+    order of application. An id that is already recorded counts as resent, and is kept once. Errors
+    are as of `new_corrections`.
     """
     while True:
         match = open_match()

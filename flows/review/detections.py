@@ -40,11 +40,9 @@ if TYPE_CHECKING:
 def detections_now(store: Store, match: Match, camera: str, frame: int) -> KeypointDetections:
     """Return the corrected detections in one match frame; no row if the camera has no frame.
 
-    The camera is a static one, or the clip of a broadcast camera; here and below.
-
-    Raises:
-        InputError: the latest run has no detections of this camera in this frame, or only with a
-            correction that was withdrawn since.
+    The camera is a static one, or the clip of a broadcast camera; here and below. InputError if the
+    latest run has no detections of this camera in this frame, or only with a correction that was
+    withdrawn since.
     """
     stored = _open(store, match, results_of(store, match, camera, frame)[0])
     taken_in = [each for each in stored.edits if isinstance(each, dict) and each["frame"] == frame]
@@ -55,11 +53,7 @@ def detections_now(store: Store, match: Match, camera: str, frame: int) -> Keypo
 
 
 def require_seen(store: Store, match: Match, edits: Sequence[Edit]) -> None:
-    """Refuse corrections that do not fit the cameras' current, corrected detections.
-
-    Raises:
-        StaleEditError: another person changed the detection, or the edit never fitted.
-    """
+    """Raise StaleEditError for corrections that do not fit the current, corrected detections."""
     found: dict[tuple[str, int], KeypointDetections] = {}
     for edit in edits:
         if not isinstance(edit, DETECTION_EDITS):
@@ -101,10 +95,7 @@ def replay_objections(store: Store, match: Match, camera: str) -> dict[int, str 
     """Return why a camera's corrections that its latest results lack do not apply, by their index.
 
     Those of them that apply have None. Objections to all others are in the results. Of a result
-    that lacks more than `MOST_REPLAYED`, there are none.
-
-    Raises:
-        InputError: as `detections_now`.
+    that lacks more than `MOST_REPLAYED`, there are none. InputError as `detections_now`.
     """
     said = edits_by_camera(match).get(camera, [])
     objections: dict[int, str | None] = {}
@@ -135,12 +126,9 @@ def _open(store: Store, match: Match, name: str) -> StoredResult:
 def results_of(
     store: Store, match: Match, camera: str, frame: int | None = None
 ) -> tuple[str, ...]:
-    """Return the latest run's results with a camera's detections, as `stage/unit`.
+    """Return the latest run's results with a camera's detections, as `stage/unit`, or InputError.
 
     With a match frame, only those of clips that contain it.
-
-    Raises:
-        InputError: there are no such results.
     """
     spec = match.folder.spec
     clips = spec.clips if frame is None else spec.clips_with(frame)
@@ -159,8 +147,7 @@ def results_of(
 def left_to_look_at(store: Store, match: Match, camera: str) -> list[OpenDetections]:
     """Return the detections that no person has accepted or corrected, by result of the camera.
 
-    Raises:
-        InputError: the latest run has no detections of this camera.
+    InputError if the latest run has none of this camera.
     """
     from worldpose.review.evidence import open_detections  # late: it imports the calibration
 
@@ -191,10 +178,8 @@ def accept(
     """Record in the journal that a person accepted detections.
 
     The person accepts every detection with at least the score `at_least` [1], if it is given, and
-    those in `people`: match frame, and index among the detections of the frame.
-
-    Raises:
-        InputError: the latest run has no detections of this camera, or not all of `people`.
+    those in `people`: match frame, and index among the detections of the frame. InputError if the
+    latest run has no detections of this camera, or not all of `people`.
     """
     names = results_of(store, match, camera)
     opened = {name: _open(store, match, name) for name in names}

@@ -50,9 +50,7 @@ def edits_since(
 ) -> Sequence[E]:
     """Return those of the edits in force, `said`, that a result has not `taken_in` yet.
 
-    Raises:
-        InputError: the result contains an edit that was withdrawn since, so that the state without
-            it is unknown.
+    InputError if it contains one that was withdrawn since: the state without that is unknown.
     """
     first, later = said[: len(taken_in)], said[len(taken_in) :]
     if [edit.model_dump(mode="json") for edit in first] != list(taken_in):

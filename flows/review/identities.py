@@ -47,9 +47,8 @@ def identities_now(
 ) -> IdentityReplay:
     """Return the tracks of a clip with all corrections, including those no run contains yet.
 
-    Raises:
-        InputError: the latest run has no tracks of this clip, or only with a correction that was
-            withdrawn since.
+    InputError if the latest run has no tracks of this clip, or only with a correction that was
+    withdrawn since.
     """
     said = said_of(match, clip)
     name, match_id = f"tracking/{clip}", match.match_id
@@ -93,10 +92,8 @@ def identity_objections(store: Store, match: Match, clip: str) -> dict[int, str 
     """Return why a clip's corrections that its latest tracks lack do not apply, by their index.
 
     Those of them that apply have None. Objections to all others are in the tracks. After more than
-    `MOST_REPLAYED` merges and splits, or before any tracks, there are none.
-
-    Raises:
-        InputError: as `identities_now`.
+    `MOST_REPLAYED` merges and splits, or before any tracks, there are none. InputError as
+    `identities_now`.
     """
     said = said_of(match, clip)
     moves = [edit for edit in said if isinstance(edit, TRACK_EDITS)]
@@ -303,9 +300,7 @@ def require_fitting(store: Store, match: Match, edits: Sequence[Edit]) -> list[E
     """Return edits, those of identities with sightings of their people in the current tracks.
 
     Without sightings, an edit would apply to another person whom later tracks give the id.
-
-    Raises:
-        StaleEditError: another person changed the identities, or the edit never fitted.
+    StaleEditError if another person changed the identities, or the edit never fitted.
     """
     found: dict[str, Identities] = {}
     seen = list(edits)

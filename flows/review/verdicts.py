@@ -192,11 +192,9 @@ def decide(
     """Record a verdict and its corrections at once; return decided ids and corrections.
 
     Without `requests`, the verdict is on all pending ones. `edits` correct the reviewed results;
-    `seen` is the state of each review as the reviewer saw it, None = any state.
-
-    Raises:
-        StaleEditError: another person decided since the reviewer looked.
-        InputError: an unknown request, no pending one, or an edit does not apply; nothing is kept.
+    `seen` is the state of each review as the reviewer saw it, None = any state. StaleEditError if
+    another person decided since the reviewer looked; InputError for an unknown request, no pending
+    one, or an edit that does not apply. Nothing is kept then.
     """
     latest = latest_run(store, match.match_id)
     ids: list[str] = []
@@ -259,11 +257,7 @@ def _decided_meanwhile(name: str, review: Review, seen: str | None) -> StaleEdit
 def correct(
     store: Store, match: Match, edits: Sequence[Edit], *, who: str, why: str
 ) -> list[Correction]:
-    """Record corrections without a verdict.
-
-    Raises:
-        InputError: an edit does not apply; none is kept.
-    """
+    """Record corrections without a verdict; InputError, and none is kept, if one does not apply."""
     latest = latest_run(store, match.match_id)
     results = {} if latest is None else latest.results
     corrections: list[Correction] = []
@@ -279,12 +273,9 @@ def correct(
 
 
 def withdraw(store: Store, match: Match, corrections: Sequence[str], *, who: str, why: str) -> None:
-    """Withdraw corrections by their ids, all or none.
+    """Withdraw corrections by their ids, all or none; InputError if one was never made.
 
     One that is withdrawn already stays so: a page repeats an undo whose answer it missed.
-
-    Raises:
-        InputError: one of the corrections was never made.
     """
 
     def withdrawals(journal: Journal) -> list[Withdrawal]:
@@ -414,8 +405,7 @@ def _corrected_by(edit: Edit, results: Iterable[str]) -> set[str]:
 def resume(store: Store, match: Match) -> list[str]:
     """Resume suspended runs of a match; return their names at the server.
 
-    Raises:
-        InputError: no Prefect server is named, or a review is pending.
+    InputError if no Prefect server is named, or a review is pending.
     """
     match_id = match.match_id
     if not has_server():

@@ -50,9 +50,9 @@ LOG = logging.getLogger("worldpose.operations")
 
 @dataclass(frozen=True)
 class Alert:
-    """An alert for an operator.
+    """An alert for an operator; link and match are empty without one.
 
-    The key identifies the cause, of which one alert is sent. Link and match are empty without one.
+    The key identifies the cause, of which one alert is sent.
     """
 
     key: str
@@ -183,10 +183,8 @@ class AlertDispatcher:
     def deliver(self, channel: Channel, pause: float = 0.0) -> float:
         """Send a channel's outstanding alerts until it fails.
 
-        `pause` is the one before this call, after a failure [s].
-
-        Returns:
-            The pause before the next call [s]; 0 = nothing failed.
+        `pause` is the one before this call, after a failure [s]. Return the pause before the next
+        call [s]; 0 = nothing failed.
         """
         while pending := self._pending(channel):
             is_flood = len(pending) > MAX_SINGLE

@@ -40,11 +40,7 @@ class Channel:
     address: str
 
     def send(self, content: Mapping[str, str]) -> None:
-        """Deliver a message with the keys `alert`, `match`, `text` and `link`.
-
-        Raises:
-            Exception: it was not accepted.
-        """
+        """Deliver a message with keys `alert`, `match`, `text` and `link`, or raise an error."""
         if self.address.startswith(("http://", "https://")):
             # A redirect is an error: it would make the POST a GET.
             answer = httpx.post(self.address, json=dict(content), timeout=ANSWER_SECONDS)
@@ -100,8 +96,7 @@ class AlertSettings(Record):
 def apprise_mail(address: str) -> str:
     """Return the Apprise URL of `smtps://USER:PASSWORD@HOST/?to=A@B&to=C@D&from=E@F`, or `smtp:`.
 
-    Raises:
-        UsageError: the address is malformed.
+    UsageError if the address is malformed.
     """
     try:
         parts = urlsplit(address)
@@ -128,8 +123,7 @@ def apprise_mail(address: str) -> str:
 def read_alert_settings(file: Path) -> AlertSettings:
     """Return the channels that a file names; none if there is no file.
 
-    Raises:
-        UsageError: the file is malformed, or other users can read it.
+    UsageError if the file is malformed, or other users can read it.
     """
     try:
         content = file.read_bytes()
@@ -161,8 +155,7 @@ def read_alert_settings(file: Path) -> AlertSettings:
 def channels_of(environment: Mapping[str, str], file: Path | None = None) -> tuple[Channel, ...]:
     """Return the channels of WORLDPOSE_ALERT_URL and WORLDPOSE_ALERT_MAIL, else of alerts.toml.
 
-    Raises:
-        UsageError: a variable or the file is malformed.
+    UsageError if a variable or the file is malformed.
     """
     kept = AlertSettings() if file is None else read_alert_settings(file)
     urls = environment.get("WORLDPOSE_ALERT_URL", "").split()

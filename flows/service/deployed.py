@@ -300,8 +300,7 @@ def release(
 def release_folder(store: Store, match_id: str, name: str, out: str | None) -> Path:
     """Return the output folder of a release.
 
-    Raises:
-        UsageError: the name is not valid for a folder, or the project is not in a local folder.
+    UsageError if the name is not valid for a folder, or the project is not in a local folder.
     """
     if out is not None:
         return Path(out)

@@ -82,12 +82,8 @@ def install(plan: ServePlan) -> dict[str, Installed]:
     """Create what is absent of deployments, pools and queues, and update what differs.
 
     Schedules, tags, pauses, limits and planned runs of a deployment stay as an operator set them.
-
-    Returns:
-        Flows that a worker can run, by deployment id.
-
-    Raises:
-        InputError: another project has deployments of this name at the server.
+    Return flows that a worker can run, by deployment id; InputError if another project has
+    deployments of this name at the server.
     """
     prefect = MatchRuns.of_plan(plan)
     if (refusal := of_other_project(prefect, plan, plan.state_folder)) is not None:

@@ -70,9 +70,8 @@ def entries(inbox: Path) -> Iterator[Entry]:
 def fingerprint_of(path: Path) -> str:
     """Return a digest of the names, sizes and times of all files of an arrival.
 
-    Raises:
-        RefusalError: the arrival is not a folder, or has a link, a special file, or an unsafe name.
-        OSError: the arrival is not readable, or changed in between.
+    RefusalError if the arrival is not a folder, or has a link, a special file, or an unsafe name;
+    OSError if it is not readable, or changed in between.
     """
     _require_plain(path.name)
     mode = path.lstat().st_mode
@@ -107,8 +106,7 @@ def fingerprint_of(path: Path) -> str:
 def missing_of(path: Path) -> str:
     """Describe the missing parts of a quiet arrival; empty if it is complete.
 
-    Raises:
-        RefusalError: its checksum list is malformed.
+    RefusalError if its checksum list is malformed.
     """
     if not _is_match(path):
         return "match.yaml is not there"
@@ -218,18 +216,10 @@ def put_in(
 ) -> None:
     """Move a whole match folder into the inbox in one step.
 
-    Args:
-        state: the state of the inbox.
-        inbox: on the disk of the folder.
-        folder: the match folder.
-        name: path in the inbox.
-        priority: when its run begins.
-        replaces: folder of the registered match whose next version it is.
-        corrects: folder of a refused arrival that it takes the place of.
-
-    Raises:
-        InputError: another next version of the match is on its way, or the arrival to correct was
-            taken in meanwhile.
+    The inbox, in which `name` is a path, is on the disk of the folder. `replaces` is the folder of
+    the registered match whose next version it is, `corrects` that of a refused arrival whose place
+    it takes. InputError if another next version is on its way, or that arrival was taken in
+    meanwhile.
     """
     target = inbox / name
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -292,8 +282,7 @@ def set_aside(inbox: Path, path: Path) -> Path:
 def find_refused(state: StateFolder, inbox: Path, name: str) -> tuple[Entry, Arrival]:
     """Return an entry of the inbox that was not taken in, with what was found of it.
 
-    Raises:
-        InputError: there is none of this name: it was taken in or removed meanwhile.
+    InputError if there is none of this name: it was taken in or removed meanwhile.
     """
     found = state.arrivals().get(name)
     for entry in entries(inbox):

@@ -148,11 +148,7 @@ def _read_arrival(file: Path, changed_ns: int, number: int) -> Arrival | None:
 
 
 def state_folder(project: str, given: Path | None) -> StateFolder:
-    """Return the state folder of a served project.
-
-    Raises:
-        UsageError: a project on object storage, and no folder is given.
-    """
+    """Return the state folder of a served project; UsageError on object storage without one."""
     if given is not None:
         return StateFolder(given.resolve())
     if "://" in project:

@@ -71,10 +71,8 @@ class MatchRuns(PrefectApi):
     ) -> QueuedRun:
         """Ask for a run of a deployment, which the worker starts in its turn.
 
-        A second call with the same key returns the run of the first.
-
-        Raises:
-            UnreachablePrefectError: no run was created.
+        A second call with the same key returns the run of the first. UnreachablePrefectError if no
+        run was created.
         """
         for known in self.queue.runs(f"queue/{flow}") if key else ():
             if known.key == key:

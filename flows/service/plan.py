@@ -140,10 +140,8 @@ TIMEZONE: Final = Path("/etc/timezone")
 def parse_schedules(texts: Iterable[str]) -> dict[str, Schedule]:
     """Return schedules given as `FLOW=CRON`, or `FLOW=CRON TIMEZONE`, by flow.
 
-    Without a time zone, times are those of this machine's zone.
-
-    Raises:
-        UsageError: an unknown flow, no valid cron expression, or an unknown time zone.
+    Without a time zone, times are those of this machine's zone. UsageError for an unknown flow or
+    time zone, or no valid cron expression.
     """
     found: dict[str, Schedule] = {}
     for text in texts:
@@ -168,8 +166,7 @@ def parse_schedules(texts: Iterable[str]) -> dict[str, Schedule]:
 def _local_timezone() -> str:
     """Return the name of this machine's time zone; UTC if it has none.
 
-    Raises:
-        UsageError: its times are not those of UTC, and no name of them is known.
+    UsageError if its times are not those of UTC, and no name of them is known.
     """
     given = os.environ.get("TZ", "").lstrip(":")
     file = Path(given or LOCALTIME)
@@ -255,8 +252,7 @@ class Secrets:
 def secrets_of(plan: ServePlan, pages: str) -> Secrets:
     """Return the secrets of a project before it is served; stored secrets are created once.
 
-    Raises:
-        UsageError: the token for metrics is short.
+    UsageError if the token for metrics is short.
     """
     metrics = os.environ.get(METRICS_TOKEN)
     if metrics is not None and len(metrics) < TOKEN_LENGTH:

@@ -49,10 +49,8 @@ def recover(plan: ServePlan, *, at_start: bool = False) -> list[str]:
     """Start runs again that were killed, or that Prefect has lost; return their names.
 
     One process at a time recovers; a second one returns at once. At the start of the worker, runs
-    that seem to start were killed with the previous one.
-
-    Raises:
-        InputError: the project's disk is away; nothing is written in its place.
+    that seem to start were killed with the previous one. InputError if the project's disk is away;
+    nothing is written in its place.
     """
     Store.open(plan.project)
     with plan.state_folder.only_one("recovery", wait=at_start) as is_alone:
@@ -229,12 +227,7 @@ class Liveness:
     def look(self, now: float, wall: float) -> None:
         """End runs that make no progress, and the worker if it takes none.
 
-        Args:
-            now: of the monotonic clock [s].
-            wall: of the machine's clock [s].
-
-        Raises:
-            InputError: the project's disk is away; nothing is written in its place.
+        Now is of the monotonic clock [s], `wall` of the machine's [s]. InputError as of `recover`.
         """
         Store.open(self.plan.project)
         self._held = {key: each for key, each in self._held.items() if each[1] > now}

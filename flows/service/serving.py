@@ -173,12 +173,9 @@ class _Supervisor:
 def serve(plan: ServePlan, secrets: Secrets, ready: Callable[[], None], tell: Tell) -> None:
     """Serve a project until SIGINT or SIGTERM.
 
-    `ready` is called when all parts answer; `tell` receives lines for the operator.
-
-    Raises:
-        InputError: a port is taken.
-        UsageError: the project is already served.
-        WorldposeError: a part does not answer in time.
+    `ready` is called when all parts answer; `tell` receives lines for the operator. InputError if a
+    port is taken, UsageError if the project is already served, WorldposeError if a part does not
+    answer in time.
     """
     Store.create(plan.project)
     state = plan.state_folder

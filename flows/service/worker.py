@@ -40,10 +40,7 @@ JOB_TEMPLATE: Final[dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Installed:
-    """A flow that the worker can run.
-
-    A run must not change the fixed parameters.
-    """
+    """A flow that the worker can run; a run must not change the fixed parameters."""
 
     flow: Flow[..., Any]
     fixed: Mapping[str, Any]
@@ -56,9 +53,8 @@ class RefusedRunError(Exception):
 def require_installed(run: FlowRun, installed: Mapping[str, Installed]) -> Installed:
     """Return the installed flow of a run.
 
-    Raises:
-        RefusedRunError: the run belongs to another deployment, sets variables of its job, or has
-            unknown or fixed parameters.
+    RefusedRunError if the run belongs to another deployment, sets variables of its job, or has
+    unknown or fixed parameters.
     """
     found = installed.get(str(run.deployment_id))
     if found is None:

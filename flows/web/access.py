@@ -63,9 +63,8 @@ class UserFile(Record):
 def read_users(file: Path) -> UserFile:
     """Return the people of a file and its proxy.
 
-    Raises:
-        UsageError: the file is missing or malformed, other users of the machine can read it, or two
-            people have the same token.
+    UsageError if the file is missing or malformed, other users of the machine can read it, or two
+    people have the same token.
     """
     problem = ""
     try:
@@ -258,11 +257,8 @@ def access_for(
 
     Without a token, the server makes and prints a random one. `names` are further names of the
     machine that browsers use, `users` is the file of the people who may log in; None = all with the
-    token. `ended` is as in `Access`.
-
-    Raises:
-        UsageError: the file or the token is not valid, or the server would listen to other
-            machines without a chosen token or without a name.
+    token. `ended` is as in `Access`. UsageError if the file or the token is not valid, or the
+    server would listen to other machines without a chosen token or without a name.
     """
     if token is not None and len(token) < TOKEN_LENGTH:
         raise UsageError(

@@ -40,10 +40,9 @@ from worldpose.store.store import Store
 
 
 def create_app(project: str, access: Access, intake: Intake | None = None) -> FastAPI:
-    """Create the server of a project's pages; without intake, people create no matches there.
+    """Create the server of a project's pages, or InputError if there is none.
 
-    Raises:
-        InputError: there is no such project.
+    Without intake, people create no matches there.
     """
     context = PageContext(Store.open(project), access)
 
@@ -87,10 +86,8 @@ def serve(
     """Serve a project's pages; return when interrupted.
 
     TLS has a certificate and a key file. Port 0 is any free one; `announce` is called when it is
-    ours. Without intake, people create no matches here.
-
-    Raises:
-        InputError: there is no such project, or the port is taken.
+    ours. Without intake, people create no matches here. InputError if there is no such project, or
+    the port is taken.
     """
     certificate, key = (None, None) if tls is None else map(str, tls)
     serve_http(

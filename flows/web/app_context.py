@@ -64,21 +64,16 @@ class PageContext:
         object.__setattr__(self, "continuing", Continuing(self.store))
 
     def registration(self, name: str) -> Registration:
-        """Return the registration of a match.
-
-        Raises:
-            HTTPException: 404; a name from outside never becomes a path.
-        """
+        """Return the registration of a match, or HTTPException 404: no name becomes a path."""
         found = self.store.registration(name) if is_name(name) else None
         if found is None:
             raise HTTPException(404, "no such match")
         return found
 
     def readable(self, name: str) -> str:
-        """Return the id of a registered match; many requests to a silent disk block all pages.
+        """Return the id of a registered match, or HTTPException as `registration`.
 
-        Raises:
-            HTTPException: as `registration`; 503, its disk does not answer.
+        It is 503 if its disk does not answer: many requests to a silent disk block all pages.
         """
         match_id = self.registration(name).spec.match_id
         if (now := self.overview.glance(match_id)).is_silent:
@@ -86,27 +81,15 @@ class PageContext:
         return match_id
 
     def match(self, name: str) -> Match:
-        """Return a registered match with its current corrections.
-
-        Raises:
-            HTTPException: as `readable`.
-        """
+        """Return a registered match with its current corrections; errors as of `readable`."""
         return open_for_review(self.store, self.readable(name))
 
     def stored_match(self, name: str) -> Match:
-        """Return a match to show its results, also while its folder is away.
-
-        Raises:
-            HTTPException: as `readable`.
-        """
+        """Return a match to show its results, if its folder is away too; errors as `readable`."""
         return open_stored(self.store, self.readable(name))
 
     def review(self, name: str, request: str) -> tuple[Match, ReviewRequest]:
-        """Return a match and one of its review requests.
-
-        Raises:
-            HTTPException: 404, there is none.
-        """
+        """Return a match and one of its review requests, or HTTPException 404."""
         match = self.match(name)
         asked = requests_by_id(match.journal.questions).get(request)
         if asked is None:
@@ -154,9 +137,8 @@ class Continuing:
     def go_on(self, match_id: str, gates: str | None = None) -> dict[str, Any]:
         """Resume the match's suspended runs, or start one; return which of the two.
 
-        Raises:
-            InputError: a suspended run has undecided reviews.
-            UnreachablePrefectError: Prefect does not answer.
+        InputError if a suspended run has undecided reviews, UnreachablePrefectError if Prefect does
+        not answer.
         """
         match: Match | None = None
         while (found := self._go_on(match_id, gates, match)) is None:
@@ -202,11 +184,8 @@ class Continuing:
     def cancel(self, match_id: str, who: str) -> bool:
         """End the match's run, or take it out of the queue; its finished results are kept.
 
-        Returns:
-            Whether a run was there that pages or the service started.
-
-        Raises:
-            UnreachablePrefectError: Prefect does not answer.
+        Return whether a run was there that pages or the service started; UnreachablePrefectError if
+        Prefect does not answer.
         """
         with self._lock:
             served = match_runs_of(self.store.url)

@@ -81,21 +81,13 @@ class Pictures:
         self._lock = Lock()
 
     def png(self, match: Match, owner: str, frame: int | None) -> bytes:
-        """Return one image as PNG.
-
-        Raises:
-            HTTPException: 404, there is none.
-        """
+        """Return one image as PNG, or HTTPException 404."""
         if frame is None and owner in match.folder.stills:
             return _find_picture(match, owner, frame).read_bytes()
         return encode_image(self.decode_image(match, owner, frame), "png")
 
     def decode_image(self, match: Match, owner: str, frame: int | None) -> NDArray[np.uint8]:
-        """Return one image (height, width, 3), RGB.
-
-        Raises:
-            HTTPException: 404, there is none.
-        """
+        """Return one image (height, width, 3), RGB, or HTTPException 404."""
         file = _find_picture(match, owner, frame)
         name = (match.match_id, owner, frame, file_mark(file))
         with self._lock:

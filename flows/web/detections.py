@@ -127,10 +127,8 @@ def _interpolate(
     """Return the edits between the last correction of a person's keypoint and a frame.
 
     The person's track tells the detections in between; frames without one are skipped, and so are
-    those in which the keypoint was corrected to be invisible.
-
-    Raises:
-        InputError: the detection has no track, or no earlier correction is of this keypoint.
+    those in which the keypoint was corrected to be invisible. InputError if the detection has no
+    track, or no earlier correction is of this keypoint.
     """
     clips = match.folder.spec.clips_with(given.frame)
     found = identities_now(store, match, clips[0].id).identities if clips else None

@@ -57,11 +57,9 @@ def take_over(
 ) -> tuple[dict[str, JsonValue], dict[str, int]]:
     """Link or copy the files of a match folder into a draft; the folder stays as it is.
 
-    Folders of images go to the draft's `match`, all other files to its `own`.
-
-    Returns:
-        match.yaml, or `instead` if that cannot be read, and the sizes of the files that a person
-        can remove, by path [byte].
+    Folders of images go to the draft's `match`, all other files to its `own`. Return match.yaml, or
+    `instead` if that cannot be read, and the sizes of the files that a person can remove, by path
+    [byte].
     """
     content, own = instead, draft / "own"
     with suppress(InputError):
@@ -88,8 +86,7 @@ def take_over(
 def copy_version(origin: Path, target: Path) -> None:
     """Link large files of a match folder into another one; copy all that cannot be linked.
 
-    Raises:
-        InputError: the disk is too small for what has to be copied.
+    InputError if the disk is too small for what has to be copied.
     """
     copied: list[tuple[Path, str]] = []
 
@@ -128,16 +125,11 @@ def build(
 ) -> tuple[list[Problem], list[str]]:
     """Make the match folder again around its footage, with what all other files of a draft say.
 
-    Args:
-        store: its matches are not to be made again.
-        content: match.yaml.
-        draft: folder of the draft: `match` is the match folder with its footage, `own` has files
-            of a match folder, and `given` those of other tools.
-        indexes: frames of the videos and sizes of the stills, by path in the match folder.
-        match_id: the registered match of which the draft is the next version.
-
-    Returns:
-        The errors that ingest finds, and sentences about what was taken from other tools' files.
+    Matches of the store are not made again, but for the next version of `match_id`. In the folder
+    of the draft, `match` is the match folder with its footage, `own` has files of a match folder,
+    and `given` those of other tools. `indexes` are frames of the videos and sizes of the stills, by
+    path in the match folder. Return the errors that ingest finds, and sentences about what was
+    taken from other tools' files.
     """
     folder, given, notes = draft / "match", draft / GIVEN, list[str]()
     own = draft / "own"

@@ -229,14 +229,9 @@ def take_given(
     with whose id, or as the only one with whose first word, its name begins; its other words name
     no other camera. Clicks may also be in images that are named after cameras.
 
-    Args:
-        store: its settings can state the pitch.
-        given: folder of the files.
-        folder: the match folder, with match.yaml and the videos.
-        indexes: frames of the videos, by path in the match folder.
-
-    Raises:
-        InputError: a file is none of these, or contradicts the match or another file.
+    Settings of the store can state the pitch. The match folder has match.yaml and videos, with
+    frames `indexes` by path in it. InputError if a file is none of these, or contradicts the match
+    or another file.
     """
     spec = read_spec(folder)
     owners = [*(camera.id for camera in spec.static_cameras), *spec.broadcast_views]

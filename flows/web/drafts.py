@@ -107,13 +107,9 @@ class Drafts:
     def create(self, who: str, match_id: str | None = None, corrects: Path | None = None) -> Draft:
         """Create a draft: empty, or with the content of a match folder, which stays as it is.
 
-        Args:
-            who: the person who creates it.
-            match_id: the registered match of which the draft is the next version.
-            corrects: the folder of a refused arrival that it begins with.
-
-        Raises:
-            InputError: there are too many drafts, no disk space for a copy, or files are gone.
+        The draft is the next version of the registered match `match_id`, or begins with the folder
+        of the refused arrival that it `corrects`. InputError if there are too many drafts, no disk
+        space for a copy, or files are gone.
         """
         known = None if match_id is None else self.store.registration(match_id)
         origin = corrects or (None if known is None else Path(known.folder))
@@ -152,11 +148,7 @@ class Drafts:
         return draft
 
     def read(self, draft_id: str) -> Draft:
-        """Return a draft.
-
-        Raises:
-            InputError: there is no draft with this id; here and below.
-        """
+        """Return a draft; InputError if there is no draft with this id, here and below."""
         try:
             content = (self._folder(draft_id) / "draft.json").read_bytes()
         except FileNotFoundError:
@@ -185,11 +177,9 @@ class Drafts:
     def add(self, draft_id: str, file: DraftFile) -> DraftFile:
         """Begin a file, or return the same one that was begun before: its transfer continues.
 
-        The id of the file and its name in the match folder are chosen here.
-
-        Raises:
-            InputError: the file is no video, still or file of a match folder, the file is empty,
-                the disk is too small for it, or the draft has too many files.
+        The id of the file and its name in the match folder are chosen here. InputError if it is no
+        video, still or file of a match folder, is empty, the disk is too small for it, or the draft
+        has too many files.
         """
         title = PurePosixPath(file.title.replace("\\", "/")).name
         title = title.lower() if title.lower() in MATCH_FILES else title
@@ -229,9 +219,7 @@ class Drafts:
         """Append a chunk that a browser sent; return whether it fitted, and the bytes now there.
 
         A chunk at another place than the end is not taken: the browser continues at the end.
-
-        Raises:
-            InputError: there is no such file, or the chunk is longer than its rest.
+        InputError if there is no such file, or the chunk is longer than its rest.
         """
         with self._hold(draft_id):
             _, file = self._find(draft_id, file_id)
@@ -251,10 +239,7 @@ class Drafts:
         """Return the image (height, width, 3) RGB at a frame of a camera's clock, `fps` a second.
 
         It is that of `FrameIndex.on_clock`, or the nearest one where the video has none, scaled to
-        a width [px].
-
-        Raises:
-            InputError: there is no such video or frame, or the image is damaged.
+        a width [px]. InputError if there is no such video or frame, or the image is damaged.
         """
         _, file = self._find(draft_id, file_id)
         index = self._index(draft_id, file) if self._whole(draft_id, file).exists() else None
@@ -288,10 +273,8 @@ class Drafts:
     def finish(self, draft_id: str, priority: Priority, revision: int | None = None) -> str | None:
         """Move a draft's match folder into the inbox in one step; return its path there.
 
-        Nothing is moved, and None returned, if another form was saved since `revision`.
-
-        Raises:
-            InputError: something is wrong or missing.
+        Nothing is moved, and None returned, if another form was saved since `revision`. InputError
+        if something is wrong or missing.
         """
         with self._hold(draft_id):
             draft = self.read(draft_id)

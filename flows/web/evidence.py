@@ -154,12 +154,9 @@ def draw_evidence(store: Store, match: Match, request: ReviewRequest) -> Evidenc
 
 
 def asked_run(store: Store, request: ReviewRequest) -> Run:
-    """Open the newest run that has the results under review.
+    """Open the newest run that has the results under review, or InputError.
 
     The run that asked may have been killed before its record was stored, or removed since.
-
-    Raises:
-        InputError: there is none.
     """
     for run_id in reversed(store.runs(request.match_id)):
         record = store.run(request.match_id, run_id)

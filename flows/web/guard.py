@@ -70,8 +70,7 @@ async def identify_in_time(
 ) -> Identity:
     """Do as `identify`; the files of the log-in form need no session.
 
-    Raises:
-        SilentDiskError: the disk of the project, or of ended sessions, does not answer.
+    SilentDiskError if the disk of the project, or of ended sessions, does not answer.
     """
     is_open = scope["path"] in OPEN and scope.get("method") in SAFE
     if is_open and access.proxy is None:

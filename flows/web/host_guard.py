@@ -32,11 +32,9 @@ def host_name(host: str) -> str:
 def refuse_foreign(scope: Scope, headers: Headers, names: Iterable[str]) -> Response | None:
     """Refuse a request that names another server or comes from another site's page.
 
-    The scope is that of an HTTP request or a WebSocket; this server has lower-case names.
-
-    Returns:
-        421 for another name in Host, 403 for a foreign Origin or Sec-Fetch-Site; None if the
-        request is allowed. A link to one of our pages from another site is no attack.
+    The scope is that of an HTTP request or a WebSocket; this server has lower-case names. Return
+    421 for another name in Host, 403 for a foreign Origin or Sec-Fetch-Site; None if the request is
+    allowed. A link to one of our pages from another site is no attack.
     """
     hosts = headers.getlist("host")
     if len(hosts) != 1 or host_name(hosts[0]) not in names:

@@ -200,10 +200,8 @@ def serve_http(
 
     Port 0 is any free one; `announce` is called when it is ours, and before it is served. Open
     connections are also limited to a quarter of the files that this process can open; options are
-    further ones of `uvicorn.Config`.
-
-    Raises:
-        InputError: the port is taken, or the host is not an address of this machine.
+    further ones of `uvicorn.Config`. InputError if the port is taken, or the host is not an address
+    of this machine.
     """
     connections = Connections(max_connections)
     protocol = type("Protocol", (_Protocol,), {"connections_open": connections})
@@ -239,10 +237,9 @@ def _listeners(host: str, port: int, connections: Connections) -> list[_Listener
 
 
 def require_free_ports(wanted: Mapping[str, tuple[str, int]]) -> None:
-    """Raise an error unless a process can listen at all ports, by the option that names them.
+    """Raise InputError unless a process can listen at all ports, by the option that names them.
 
-    Raises:
-        InputError: a port is taken or wanted twice, or a host is not an address of this machine.
+    A port may be taken or wanted twice, or a host not an address of this machine.
     """
     with ExitStack() as opened:
         for option, (host, port) in wanted.items():

@@ -35,10 +35,7 @@ OVERTAKEN: Final = "another page saved this form meanwhile: look at it as it is 
 
 @dataclass(frozen=True)
 class Intake:
-    """Where pages put new matches, and where they find videos.
-
-    The folders are read-only.
-    """
+    """Where pages put new matches, and read-only folders where they find videos."""
 
     inbox: Path
     folders: Sequence[Path] = ()
@@ -137,9 +134,8 @@ def _add_ways_back(router: APIRouter, intake: Intake, context: PageContext) -> N
 def _begin(drafts: Drafts, intake: Intake, context: PageContext, who: str, given: NewDraft) -> str:
     """Create a draft; return its id.
 
-    Raises:
-        HTTPException: 404, there is no such match; 503, its disk does not answer.
-        InputError: the arrival cannot be corrected on a page.
+    HTTPException 404 without such a match, 503 if its disk does not answer; InputError if the
+    arrival cannot be corrected on a page.
     """
     if given.match is not None:
         return drafts.create(who, context.readable(given.match)).id

@@ -52,8 +52,7 @@ class Proposals:
     def find(self, match_id: str) -> tuple[ClockOffsets, bytes]:
         """Return the offsets of a match by its latest run, and their plot as PNG.
 
-        Raises:
-            InputError: there is no run, or fewer than two cameras have a calibration and 2D poses.
+        InputError if there is no run, or fewer than two cameras have a calibration and 2D poses.
         """
         from worldpose.reports.drawing import draw_synchronization  # late: it loads matplotlib
 

@@ -82,11 +82,7 @@ class DrawnFiles:
         return file
 
     def clip_video(self, store: Store, run: Run, match: Match, clip: str) -> FileResponse:
-        """Return the response with the overlay video of a clip.
-
-        Raises:
-            HTTPException: 404, no video of the clip is at hand.
-        """
+        """Return the response with the overlay video of a clip, or HTTPException 404."""
         if clip_view(run, match, clip) is None:
             raise HTTPException(404, "no video of this clip is at hand")
         file = self.get(

@@ -23,9 +23,7 @@ def list_videos(folders: Sequence[Path], number: int, path: str) -> dict[str, An
     """Return the folders and videos inside a folder: names, and sizes of videos [byte].
 
     The path, with forward slashes, leads on from one of the folders that the operator named.
-
-    Raises:
-        InputError: there is no such folder, or the path is unsafe.
+    InputError if there is no such folder, or the path is unsafe.
     """
     inside, videos = [], []
     with _open_below(folders, number, path, is_folder=True) as folder, os.scandir(folder) as found:

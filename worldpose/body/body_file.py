@@ -70,21 +70,13 @@ def is_open_body(name: str) -> bool:
 
 
 def load_body(path: Path) -> BodyModel:
-    """Return the body model of a file that `save_body` wrote.
-
-    Raises:
-        InputError: the file is missing, damaged or no body model.
-    """
+    """Return the body model of a file that `save_body` wrote; InputError if it is none."""
     arrays = read_npz_arrays(path, (*KEYS, "name"))
     return _build_model(arrays, str(arrays["name"]), path)
 
 
 def save_body(path: Path, model: BodyModel) -> None:
-    """Write a model in single precision, to 0.1 um; the file appears complete or not at all.
-
-    Raises:
-        InputError: the file exists and differs.
-    """
+    """Write a model in single precision, 0.1 um, whole or not at all; InputError if it differs."""
     root = np.where(model.parents < 0, np.iinfo(np.uint32).max, model.parents)
     arrays = {
         "v_template": model.template.astype(np.float32),
@@ -112,11 +104,7 @@ def save_body(path: Path, model: BodyModel) -> None:
 
 
 def read_npz_arrays(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[np.generic]]:
-    """Return arrays of an npz file; Python objects in it are refused unread.
-
-    Raises:
-        InputError: the file is missing or damaged, or lacks a key.
-    """
+    """Return arrays of an npz file with these keys; Python objects in it are refused unread."""
     try:
         arrays = read_npz_members(path, keys)
         return {key: arrays[key] for key in keys}
@@ -130,10 +118,7 @@ def read_pickled_arrays(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[
     """Return arrays of a pickled dictionary, dense even if the pickle holds sparse ones.
 
     The function reads numpy's, scipy's and chumpy's arrays without running anything that the file
-    names (`worldpose.pickles`).
-
-    Raises:
-        InputError: the file cannot be read, names anything but arrays, or lacks a key.
+    names (`worldpose.pickles`). InputError if the file names anything but arrays, or lacks a key.
     """
     from worldpose.pickles import read_pickle  # late: it imports scipy
 
@@ -166,11 +151,7 @@ def _body_file_error(path: Path, found: str) -> InputError:
 
 
 def _build_model(arrays: Mapping[str, NDArray[np.generic]], name: str, path: Path) -> BodyModel:
-    """Return the model of a file's arrays.
-
-    Raises:
-        InputError: the arrays are not a body model's.
-    """
+    """Return the model of a file's arrays; InputError if they are not a body model's."""
     for key, array in arrays.items():
         dimensions = 3 if key in ("shapedirs", "posedirs") else 2
         kinds = "iu" if key in ("kintree_table", "f") else "fiu"
@@ -208,17 +189,11 @@ def given_body_folder() -> str | None:
 
 
 def install_body(file: Path, folder: Path | None = None, name: str | None = None) -> BodyModel:
-    """Return a model read from SMPL's own file, after saving it as a safe npz file.
+    """Return a model read from SMPL's own file, .pkl or .npz, after saving it as a safe npz file.
 
-    Args:
-        file: SMPL's .pkl or .npz, as downloaded.
-        folder: where `<name>.npz` is written, `body_folder()` by default.
-        name: name of the model in results.
-
-    Raises:
-        InputError: the file is not a body model in SMPL's layout, or names code to run, or another
-            one of the same name is installed.
-        UsageError: the name is invalid.
+    `<name>.npz` is written to `folder`, `body_folder()` by default. InputError if the file is no
+    body model in SMPL's layout, names code to run, or another one of the name is installed;
+    UsageError if the name is invalid.
     """
     model_name = name or file.stem.lower().replace("_", "-")
     if not _NAME.fullmatch(model_name) or model_name.startswith("open-neutral"):
@@ -285,15 +260,7 @@ def body_path(name: str, folder: Path | None = None) -> Path:
 
 
 def digest_of_body(name: str, folder: Path | None = None) -> str:
-    """Return the SHA-256 of an installed model's file.
-
-    Args:
-        name: name of the model.
-        folder: folder of installed bodies; `body_folder()` by default.
-
-    Raises:
-        UsageError: no body of that name is installed.
-    """
+    """Return the SHA-256 of an installed model's file; UsageError if there is none."""
     return hashlib.sha256(_find_installed(name, folder).read_bytes()).hexdigest()
 
 

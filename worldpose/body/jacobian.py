@@ -91,12 +91,9 @@ class ChainedKeypoints:
         return cls(model, rest[0], vectors)
 
     def move_points(self, first: int, joints: NDArray[np.int64], by: Floats) -> ChainedKeypoints:
-        """Return the keypoints with some moved by vectors fixed to joints.
+        """Return the keypoints, with those from index `first` on moved by vectors fixed to joints.
 
-        Args:
-            first: index of the first of these keypoints.
-            joints: (n,) joint that moves each of them and those after it.
-            by: (n, 3) [m], in the axes of the unposed body.
+        Joints are (n,), vectors (n, 3) [m], in the axes of the unposed body.
         """
         vectors = self.vectors.copy()
         vectors[first + np.arange(len(joints)), joints, :, 0] += by
@@ -202,13 +199,9 @@ def _own_change(local: Floats, turns: Floats, axes: Floats, parents: NDArray[np.
 def _turn_joints(angles: Floats, parents: NDArray[np.int64]) -> tuple[Floats, Floats, Floats]:
     """Return rotations of joints relative to parent and world, and axes of their angles.
 
-    Args:
-        angles: (n, joints, 3) [rad], axis-angle vectors relative to the parent.
-        parents: (joints,).
-
-    Returns:
-        Local and world rotations (n, joints, 3, 3), and axes (n, joints, 3, 3): column c is the
-        angular velocity in the world while angle c grows.
+    Angles (n, joints, 3) [rad] are axis-angle vectors relative to the parents (joints,). Rotations
+    are (n, joints, 3, 3), as are axes: column c is the angular velocity in the world while angle c
+    grows.
     """
     count, joints = angles.shape[:2]
     local = np.empty((count, joints, 3, 3))
@@ -271,14 +264,9 @@ def _sum_levers(
 ) -> tuple[Floats, Floats]:
     """Return sums of rotated terms (n, keypoints, 3) [m] and Jacobian (n, keypoints, 3, 72).
 
-    Args:
-        turns: (n, 24, 3, 3), world rotations.
-        axes: (n, 24, 3, 3), of the angles.
-        terms: (n, terms, 3) [m], unturned, by ascending keypoint.
-        keypoint: (terms,).
-        joint: (terms,), the joint that rotates the term.
-        moves: (keypoints, 24), whether a joint has any part in a keypoint.
-        parents: (24,).
+    World rotations and axes of the angles are (n, 24, 3, 3), terms (n, terms, 3) [m], unturned. A
+    term has a keypoint (terms,), ascending, and a joint (terms,) that rotates it; `moves`
+    (keypoints, 24) is whether a joint has any part in a keypoint. Parents are (24,).
     """
     count, joints = turns.shape[:2]
     keypoints = np.zeros((count, len(moves), 3))

@@ -22,14 +22,11 @@ BODY_POSE = 69
 
 @dataclass(frozen=True, eq=False)
 class BodyParameters:
-    """One body or a batch of them; batch dimensions broadcast against each other.
+    """One body or a batch of them; batch dimensions broadcast against each other, or InputError.
 
     Rotations are axis-angle vectors relative to the parent joint. `global_orient` rotates the body
     about its pelvis joint, and `transl` is added after that: the pelvis of a body stands at
     `transl` plus the pelvis of its unposed shape.
-
-    Raises:
-        InputError: an array has the wrong trailing shape or the batches do not broadcast.
     """
 
     betas: NDArray[np.float64]
@@ -111,12 +108,10 @@ class Articulation:
 def articulate(
     rest: NDArray[np.float64], local_rotations: NDArray[np.float64], parents: NDArray[np.int64]
 ) -> Articulation:
-    """Return the frames of the joints of a kinematic tree.
+    """Return the frames of the joints (..., joints, 3) [m] of an unposed kinematic tree.
 
-    Args:
-        rest: (..., joints, 3) [m], joints of the unposed body.
-        local_rotations: (..., joints, 3, 3), of each joint relative to its parent.
-        parents: (joints,), each smaller than its joint, -1 for the root, which stays in place.
+    `local_rotations` (..., joints, 3, 3) are relative to the parents (joints,), each smaller than
+    its joint, -1 for the root, which stays in place.
     """
     rotations, joints = local_rotations.copy(), rest.copy()
     for joint, parent in enumerate(parents[1:], start=1):
@@ -130,11 +125,7 @@ def articulate(
 
 @dataclass(frozen=True, eq=False)
 class BodyModel:
-    """A body in the layout of SMPL.
-
-    Raises:
-        InputError: the arrays do not fit each other or are not a body model.
-    """
+    """A body in the layout of SMPL; InputError if its arrays are no body model's."""
 
     name: str
     """Name and version that results carry, such as `open-neutral/2`."""
@@ -215,11 +206,7 @@ class BodyModel:
         return moved
 
     def articulate(self, parameters: BodyParameters) -> Articulation:
-        """Return the posed frame of every joint, before `transl`.
-
-        Raises:
-            InputError: the number of betas is not this model's.
-        """
+        """Return the posed frame of every joint, before `transl`; InputError for other betas."""
         if parameters.betas.shape[-1] != self.shapes:
             raise InputError(
                 "BodyParameters.betas",
@@ -282,10 +269,7 @@ def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> N
 def cluster_vertices(
     vertices: NDArray[np.float64], faces: NDArray[np.int64], keys: NDArray[Any]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return one vertex for each cell, nearest to the cell's mean, and the faces between these.
-
-    `keys` (vertices, k) tell the cell of each vertex.
-    """
+    """Return a vertex for each cell, `keys` (vertices, k), nearest to its mean, and the faces."""
     _, cell = np.unique(keys, axis=0, return_inverse=True)
     cell = cell.ravel()
     count = np.bincount(cell)

@@ -31,10 +31,8 @@ def facing_axes(joints: Floats) -> tuple[Floats, Floats]:
 def find_hiders(pixels: Floats, depth: Floats, size: Floats) -> NDArray[np.int16]:
     """Return the nearest of the persons before a joint (frames, persons, joints), -1 for none.
 
-    Args:
-        pixels: (frames, persons, joints, 2) [px], COCO-17 first.
-        depth: (frames, persons) of trunks [m].
-        size: (frames, persons) height of a standing person there [px].
+    Pixels (frames, persons, joints, 2) begin with COCO-17; depth (frames, persons) [m] is of
+    trunks, size (frames, persons) [px] the height of a standing person there.
     """
     persons = depth.shape[1]
     hider = np.full(pixels.shape[:3], -1, np.int16)
@@ -75,9 +73,8 @@ def is_covered(points: Floats, body: Floats, size: Floats, parts: Capsules = CAP
 def hidden_joints(joints: Floats, camera: Camera) -> Flags:
     """Return which joints a nearer person hides (frames, persons, joints).
 
-    Args:
-        joints: (frames, persons, joints, 3) [m], world, COCO-17 first; NaN where missing.
-        camera: one camera, or (frames,); NaN where a frame has none.
+    Joints (frames, persons, joints, 3) [m], world, begin with COCO-17, NaN where missing. The
+    camera is one, or (frames,), NaN where a frame has none.
     """
     stature = 1.8  # mean height of a person [m]
     frames, persons, count, _ = joints.shape

@@ -80,11 +80,8 @@ def shorten_limbs(joints: Floats, covariance: Floats) -> Floats:
     """Return joints (frames, 17, 3) [m] with limbs of the true mean length.
 
     Bodies oriented by noisy joints point along the noisy bones, which are longer than the true ones
-    by half the variance across over the length.
-
-    Args:
-        joints: (frames, 17, 3) [m].
-        covariance: (frames, 17, 3, 3) [m^2], true to the joints' errors.
+    by half the variance across over the length. The covariance (frames, 17, 3, 3) [m^2] is true to
+    the joints' errors.
     """
     shortened = joints.copy()
     # Arms and legs of COCO-17, outward.
@@ -145,14 +142,11 @@ def agree(one: Shape, other: Shape, level: float = 0.001) -> bool:
 
 
 def pool_shapes(shapes: Sequence[Shape], weights: Sequence[float]) -> Shape:
-    """Return one person's shape from several clips: information-weighted means.
+    """Return one person's shape, of one body model, from clips: information-weighted means.
 
-    Every covariance includes the normal prior of betas, which counts once. Clips count as
-    independent, although the detector's offsets are the same in all of them.
-
-    Args:
-        shapes: shapes of one person and body model, at least one.
-        weights: weight of that prior in each of them [1], `prior_weight` of the settings.
+    Every covariance includes the normal prior of betas, which counts once; `weights` are the
+    prior's in each clip [1], `prior_weight` of the settings. Clips count as independent, although
+    the detector's offsets are the same in all of them.
     """
     further = max(weights) - sum(weights)
     precisions = [np.linalg.inv(shape.covariance) for shape in shapes]

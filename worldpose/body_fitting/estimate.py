@@ -86,14 +86,11 @@ def fit_in_windows(
     ground: Ground | None = None,
     known_shapes: Mapping[int, Shape] | None = None,
 ) -> Iterator[tuple[slice, BodyFit]]:
-    """Yield the bodies of `fit_bodies` for consecutive frames of a clip of any length.
+    """Yield the bodies of `fit_bodies` for consecutive frames of a clip of any length, with these.
 
     Shape starts from bone lengths, poses from hips and torso; then betas, coarse poses and the
     detector's shared offsets are estimated together from some seconds of each person, and last the
     poses of all frames with fixed betas and offsets.
-
-    Yields:
-        Frames, and the bodies in these frames.
     """
     clip = _learn_clip(
         evidence,
@@ -188,11 +185,9 @@ def _read_samples(
 
 @dataclass(frozen=True, eq=False)
 class _ClipBodies:
-    """Shapes, offsets and spans, which all frames of a clip share.
+    """Shapes, offsets and spans from a person's first joint to the last, which all frames share.
 
-    Attributes:
-        spans: frames from a person's first joint to the last.
-        points: points besides COCO-17; None without evidence about any.
+    `points` are those besides COCO-17; None without evidence about any.
     """
 
     solver: PoseSolver

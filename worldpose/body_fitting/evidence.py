@@ -57,11 +57,9 @@ def body_axes(joints: Floats) -> Floats:
 
 
 def perceived_joints(joints: Floats, offsets: Floats) -> Floats:
-    """Return the detector's joints (frames, persons, 17, 3) of bodies [m], world.
+    """Return the detector's joints (frames, persons, 17, 3) of bodies' ones [m], world.
 
-    Args:
-        joints: (frames, persons, 17, 3) [m], world.
-        offsets: (17, 3) [m] from a body's joint to the detector's: forward, left, up.
+    Offsets (17, 3) [m] are from a body's joint to the detector's: forward, left, up.
     """
     moved: Floats = joints + np.einsum("fpab,jb->fpja", body_axes(joints), offsets)
     return moved
@@ -70,9 +68,8 @@ def perceived_joints(joints: Floats, offsets: Floats) -> Floats:
 def random_covariance(covariance: Floats, common_bias: Floats) -> Floats:
     """Return the covariance of joints without most of the bias that the shared offsets model.
 
-    Args:
-        covariance: (..., 17, 3, 3) [m^2], of triangulated joints or of bodies.
-        common_bias: (17,) per axis [m], included in `covariance`.
+    It is (..., 17, 3, 3) [m^2], of triangulated joints or of bodies, and includes `common_bias`
+    (17,) per axis [m].
     """
     random = covariance.astype(np.float64)
     for axis in range(3):
@@ -97,13 +94,9 @@ class PersonEvidence:
     def add_points(
         self, joints: Floats, covariance: Floats, fps: float, settings: BodyFittingSettings
     ) -> PersonEvidence:
-        """Return the evidence with points besides COCO-17 after it.
+        """Return the evidence with points besides COCO-17 after it; arguments as of `of`.
 
-        Args:
-            joints: (frames, points, 3) [m], world; NaN where missing.
-            covariance: (frames, points, 3, 3) [m^2], as triangulation states it.
-            fps: [1/s].
-            settings: correlation time of the noise.
+        Joints are (frames, points, 3) [m], NaN where missing.
         """
         own = self.of(joints, covariance, fps, settings)
         return PersonEvidence(
@@ -122,11 +115,8 @@ class PersonEvidence:
     ) -> PersonEvidence:
         """Return the evidence of joints whose errors last for `noise_time_s`.
 
-        Args:
-            joints: (frames, 17, 3) [m], world; or other points.
-            covariance: (frames, 17, 3, 3) [m^2], as triangulation states it.
-            fps: [1/s].
-            settings: correlation time of the noise.
+        Joints are (frames, 17, 3) [m], world, or other points; their covariance (frames, 17, 3, 3)
+        [m^2] is as triangulation states it.
         """
         seen = np.asarray(np.isfinite(joints).all(-1) & np.isfinite(covariance).all((-1, -2)))
         stated = np.where(seen[..., None, None], covariance, np.eye(3))
@@ -141,11 +131,8 @@ class PersonEvidence:
     ) -> PersonEvidence:
         """Return the evidence with lines of sight added.
 
-        Args:
-            points: (frames, 17, 3) [m], world, on the lines; NaN without.
-            across: (frames, 17, 3, 3) [1], projections across the lines; 0 without.
-            fps: [1/s].
-            settings: standard deviation of a joint from its line.
+        Points (frames, 17, 3) [m], world, are on the lines, NaN without; `across` (frames, 17, 3,
+        3) [1] are projections across them, 0 without.
         """
         rows = np.flatnonzero(np.isfinite(points).all(-1).any(-1))
         if not len(rows):
@@ -200,13 +187,8 @@ def find_contacts(
 ) -> Contacts:
     """Return contacts of ankles that are low and slow for at least two frames.
 
-    Args:
-        joints: (frames, 17, 3) [m], world, of a fit.
-        ankle_height: height of this person's ankle above the sole [m].
-        ground: the surface.
-        fps: [1/s].
-        settings: limits of low and slow.
-        starts: first frames of the track's further intervals, as in `PersonObjective`.
+    Joints (frames, 17, 3) [m], world, are of a fit, the ankle's height above the sole [m] of this
+    person. `starts` are the first frames of the track's further intervals.
     """
     ankles = joints[:, ANKLES]
     height = ground(ankles[..., 0], ankles[..., 1]) + ankle_height

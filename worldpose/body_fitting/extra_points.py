@@ -66,11 +66,7 @@ def perceived_points(
 ) -> Floats:
     """Return vectors (..., points, 3) [m], world, from the body's points to the detector's.
 
-    Args:
-        model: the body.
-        points: names of the points.
-        parameters: bodies (...).
-        offsets: (points, 3) [m], as in `ExtraFit`.
+    Bodies are (...), offsets (points, 3) [m] as in `ExtraFit`.
     """
     turned = model.articulate(parameters).rotations[..., point_segments(model, points), :, :]
     moved: Floats = np.einsum("...pab,pb->...pa", turned, offsets)
@@ -87,14 +83,8 @@ def learn_point_offsets(
     """Return the offsets of a detector's points, their variance, and the variance around them.
 
     All are (points, 3) [m, m^2, m^2]. The last is the mean over persons of the squared spread in
-    time, from the median absolute deviation: errors that views share and that differ by pose.
-
-    Args:
-        solver: solver that knows the points.
-        points: names of the points.
-        people: joints and points of each person in some seconds.
-        shapes: betas of each person, and offsets of the joints.
-        fps: [1/s].
+    time, from the median absolute deviation: errors that views share and that differ by pose. The
+    solver knows the points; people have joints and points of some seconds.
     """
     model = solver.chained.model
     offsets = np.zeros((len(points), 3))
@@ -176,12 +166,7 @@ def _mirror_place(points: tuple[str, ...], place: int) -> int | None:
 
 
 def densest_interval(known: NDArray[np.integer], fps: float) -> slice:
-    """Return the interval of two seconds with the most points.
-
-    Args:
-        known: (frames,) number of a person's points in each frame.
-        fps: [1/s].
-    """
+    """Return the interval of two seconds with the most of a person's points, `known` (frames,)."""
     total = np.concatenate([[0], np.cumsum(known, dtype=np.int64)])
     # Time of each person from which offsets are learned [s]: they are few numbers.
     length = min(max(3, round(2.0 * fps)), len(known))
@@ -213,10 +198,8 @@ class PointModel:
 
     Attributes:
         solver: solver of poses that knows the points, where the detector has them.
-        points: (points,) names.
         offsets: (points, 3) [m], as in `ExtraFit`.
-        modelled: (points, 3) [m^2], part of the triangulated points' variance that the offsets
-            model.
+        modelled: (points, 3) [m^2], part of the triangulated points' variance in the offsets.
         systematic: (points, 3, 3) [m^2], covariance of the offsets and of the common bias.
     """
 
@@ -249,11 +232,7 @@ def learn_points(
 ) -> PointModel:
     """Return the model of a detector's points, learned from some seconds of each person.
 
-    Args:
-        solver: solver of the joints.
-        people: joints of each person, and the points that the body model has, (frames, 1, points).
-        shapes: betas of each person, and offsets of the joints.
-        fps: [1/s].
+    Each has joints, and the points that the body model has, (frames, 1, points).
     """
     found = next(iter(people.values()))[1]
     points, settings = found.points, solver.settings

@@ -29,13 +29,10 @@ from worldpose.triangulation.results import Reconstruction
 
 @dataclass(frozen=True, eq=False)
 class ReconstructedBodies:
-    """People of a clip.
+    """People of a clip, with `frame` (frames,) numbers and `person` (persons,) identities.
 
-    Attributes:
-        frame: (frames,) number of each frame.
-        person: (persons,) identity of each person.
-        joints: triangulated joints, smoothed over time, and the clock offsets of the cameras.
-        bodies: (frames, persons) bodies and their joints.
+    `joints` are triangulated, smoothed over time, with the cameras' clock offsets; `bodies` are
+    (frames, persons).
     """
 
     frame: NDArray[np.int64]

@@ -55,8 +55,6 @@ class SeenClip:
         cameras: batch (cameras,).
         camera_covariance: (cameras, 12, 12) as in `triangulate_frames`, or None.
         detections: detections of the tracked people, left-right swaps undone.
-        settings: settings of triangulation.
-        fps: [1/s].
     """
 
     cameras: Camera
@@ -119,10 +117,8 @@ def compare_held_out(
     """Compare fitted and triangulated joints with the keypoints of held-out cameras.
 
     Shapes, the detector's offsets and noise are those of the whole clip: few numbers, which
-    thousands of keypoints determine. Joints and poses know nothing of the held-out cameras.
-
-    Returns:
-        None without people, or if too few cameras remain to triangulate.
+    thousands of keypoints determine. Joints and poses know nothing of the held-out cameras. None
+    without people, or if too few cameras remain to triangulate.
     """
     count, frames = clip.cameras.batch_shape[0], len(clip.detections.detection_index)
     known = np.flatnonzero(np.isfinite(fit.betas).all(-1))

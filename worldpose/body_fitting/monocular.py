@@ -54,12 +54,8 @@ def read_monocular(path: Path) -> MonocularEstimates:
     of the camera (`transl` with `focal_length` and `img_size`: full perspective). Boxes are
     centers, or x0 y0 x1 y1 and anything after them, or VIBE's `bboxes` with `frame_ids`: center,
     width and height. `frame` gives the rows' frames; without it each row is a frame of its own.
-
-    Args:
-        path: written by `numpy.savez`; save the arrays of a pickle this way.
-
-    Raises:
-        InputError: unreadable, or without rotations or positions.
+    `numpy.savez` also saves the arrays of a pickle this way. InputError without rotations or
+    positions.
     """
     require_file(path)
     # Maximum size of the arrays of one file [byte]: 1.5 million bodies as matrices.
@@ -67,11 +63,7 @@ def read_monocular(path: Path) -> MonocularEstimates:
 
 
 def parse_monocular(arrays: Mapping[str, NDArray[Any]], where: Path) -> MonocularEstimates:
-    """Return the bodies of arrays in the layout of a file that `read_monocular` reads.
-
-    Raises:
-        InputError: arrays are missing or have wrong shapes; the error names `where`.
-    """
+    """Return the bodies of arrays as of `read_monocular`; InputError, with `where`, for others."""
     # Names of all 24 rotations in one array.
     names_of_all = ("pred_thetas", "pred_theta_mats", "poses", "pose", "thetas")
     whole = _first_present(arrays, names_of_all)
@@ -208,11 +200,8 @@ def place_monocular_poses(
     a broadcast image. The assignment minimizes the distances to the middle of the projected joints,
     frame by frame.
 
-    Args:
-        estimates: poses estimated in images of the camera.
-        camera: batch (frames,).
-        frame: (frames,), frame numbers.
-        joints: (frames, persons, 17, 3) [m], world; gaps are interpolated.
+    The camera is a batch (frames,) with numbers (frames,); gaps of joints (frames, persons, 17, 3)
+    [m], world, are interpolated.
     """
     frames, persons = joints.shape[:2]
     orient = np.full((frames, persons, 3, 3), np.nan)
@@ -278,9 +267,7 @@ class MonocularPrior:
     def normal_equations(self, orient: Floats, angles: Floats) -> tuple[Floats, Floats, float]:
         """Return matrices (frames, 33, 33), gradient (frames, 33) and cost for a pose.
 
-        Args:
-            orient: (frames, 3) [rad].
-            angles: (frames, 30) [rad].
+        It has orientations (frames, 3) and angles (frames, 30) [rad].
         """
         away = deviations(self.orient, self.angles, orient, angles)
         away = np.where(self.used[:, None], away, 0.0)
@@ -306,14 +293,11 @@ def learn_precision(
     sure: NDArray[np.bool_],
     correlated_frames: float,
 ) -> Floats:
-    """Return the precision (33, 33) [1/rad^2] of a monocular pose.
+    """Return the precision (33, 33) [1/rad^2] of a monocular pose of one clip.
 
-    Args:
-        monocular: monocular poses of one clip.
-        orient: (frames, persons, 3) [rad], of bodies fitted without monocular poses.
-        angles: (frames, persons, 30) [rad], of the same.
-        sure: (frames, persons), bodies much more accurate than monocular poses.
-        correlated_frames: frames with correlated errors, which count as one.
+    Orientations (frames, persons, 3) and angles (frames, persons, 30) [rad] are of bodies fitted
+    without monocular poses; those that are `sure` (frames, persons) are much more accurate. So many
+    `correlated_frames` count as one.
     """
     there = sure & np.isfinite(monocular.angles[..., 0]) & np.isfinite(angles[..., 0])
     away = deviations(
@@ -332,15 +316,10 @@ def carry_errors(
     The errors of a method for a person in an interval with few cameras mostly exist just before and
     after it too, where the fit reveals them (simple kriging).
 
-    Args:
-        known: (frames, 3, 3), world from body.
-        known_angles: (frames, 30) [rad].
-        off: (frames, 33) [rad], from estimates to more accurate fits; NaN without one.
-        used: (frames,), estimates to correct.
-        lasting: correlation time of errors, to a factor e [frame].
-
-    Returns:
-        The first two arguments, corrected, and the share (frames,) of the variance that is left.
+    `known` (frames, 3, 3), world from body, and `known_angles` (frames, 30) [rad] are returned
+    corrected where `used` (frames,), with the share (frames,) of the variance that is left. `off`
+    (frames, 33) [rad] is from estimates to more accurate fits, NaN without one; errors last for
+    `lasting` frames, to a factor e.
     """
     # Share of an estimate's variance that is independent from frame to frame [1].
     independent_share = 0.3
@@ -396,14 +375,9 @@ def monocular_priors(
 ) -> dict[int, MonocularPrior]:
     """Return monocular poses of persons for frames with few well-determined joints.
 
-    Args:
-        poses: orientation (frames, persons, 3) [rad] and angles (frames, persons, 69) [rad] of
-            bodies fitted without monocular poses.
-        joint_seen: (frames, persons, 17), triangulated joints.
-        covariance: (frames, persons, 17, 3, 3) [m^2], of these.
-        estimates: monocular poses.
-        spans: frames of each person.
-        fps: [1/s].
+    Poses are orientations (frames, persons, 3) and angles (frames, persons, 69) [rad] of bodies
+    fitted without monocular poses. `joint_seen` (frames, persons, 17) are triangulated, with a
+    covariance (frames, persons, 17, 3, 3) [m^2]; `spans` are the frames of each person.
     """
     variance = np.trace(covariance[:, :, 5:], axis1=-2, axis2=-1) / 3.0
     # Joints are well determined if their median standard deviation per axis is below this [m]: 16

@@ -31,16 +31,9 @@ def fit_in_windows(
 ) -> Iterator[tuple[slice, BodyFit]]:
     """Yield the paper's bodies for consecutive frames, as `estimate.fit_in_windows` yields ours.
 
-    A person's shape is that of its first window. The paper states no covariance: that of a
-    person's joints is the mean square distance to the triangulated joints, and that of the betas is
-    their prior's.
-
-    Args:
-        model: the body.
-        evidence: triangulated joints.
-        seen: static cameras (cameras,) and the detections of the tracked people.
-        settings: the longest gap that motion fills.
-        known_shapes: shapes from other clips, by person index.
+    A person's shape is that of its first window. The paper states no covariance: that of a person's
+    joints is the mean square distance to the triangulated joints, and that of the betas is their
+    prior's. `seen` are static cameras (cameras,) and the detections of the tracked people.
     """
     cameras, body = TensorCameras.of(seen[0]), DifferentiableBody(fold_keypoints(model, COCO17))
     shapes = {person: shape.betas for person, shape in known_shapes.items()}

@@ -196,9 +196,7 @@ class _Clip:
 
     Attributes:
         solver: body, prior, settings and ground.
-        evidence: observations.
         lifted: (frames, persons, 17, 3) [m], keypoints at the distance of the places.
-        poses: monocular poses.
         agreeing: (frames, persons), poses that agree with the keypoints.
     """
 
@@ -389,12 +387,8 @@ class _Clip:
         """Return the covariance (frames, 17, 3, 3) [m^2] that all frames of a person share.
 
         It is the calibration's, the foot's bias over the slope of the line of sight, and that of a
-        lean of the whole body, by which joints move along their lines of sight.
-
-        Args:
-            person: the person.
-            own: frames and places of the person.
-            joints: (frames, 17, 3) [m], world, in the frames of the span.
+        lean of the whole body. By the lean, joints (frames, 17, 3) [m], world, in the span's frames
+        move along their lines of sight.
         """
         rows = np.arange(own.span.start, own.span.stop)
         sight, place, _ = self._sight(person, rows, self.evidence.fps)

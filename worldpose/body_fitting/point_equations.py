@@ -39,13 +39,10 @@ def accumulate_points(
     Blocks on the diagonal are whole in the lower triangle alone, which is all that the factor
     reads. A point moves with few of the angles: products skip those that leave it in place.
 
-    Args:
-        rows: (frames, points, 3, 36), derivatives of points.
-        own: (frames, points, 3, 3), their information.
-        next_frame: (frames, points), weight of the product with the point in the next frame.
-        second_frame: (frames, points), the same with the frame after.
-        force: (frames, points, 3), derivative of the cost by the points.
-        tied: whether terms tie frames; without them there are only the blocks (1, frames, 36, 36).
+    `rows` (frames, points, 3, 36) are derivatives of points, `own` (frames, points, 3, 3) is their
+    information, and `force` (frames, points, 3) the derivative of the cost by them. `next_frame`
+    and `second_frame` (frames, points) weigh the product with the point in the next frame and the
+    one after; unless `tied`, there are only the blocks (1, frames, 36, 36).
     """
     frames, points, _, size = rows.shape
     blocks = np.zeros((3 if tied else 1, frames, size, size))
@@ -110,9 +107,8 @@ def _round_up(count: int, most: int) -> int:
 def propagate(rows: Floats, covariance: Floats) -> Floats:
     """Return the covariance of points (frames, points, 3, 3) [m^2].
 
-    Args:
-        rows: (frames, points, 3, n), derivatives of points by n unknowns, most of them zero.
-        covariance: (frames, n, n), of the unknowns.
+    `rows` (frames, points, 3, n) are derivatives by n unknowns, most of them zero, whose covariance
+    is (frames, n, n).
     """
     frames, points, _, size = rows.shape
     spread = np.empty((frames, points, 3, 3))
@@ -154,9 +150,8 @@ def propagate_alone(rows: Floats, information: Floats) -> Floats:
     R^T of all points is Y^T Y, whose blocks on the diagonal are those of the points. It is infinite
     where rounding leaves no factor.
 
-    Args:
-        rows: (frames, points, 3, n), derivatives R of points by n unknowns.
-        information: (frames, n, n), of the unknowns, valid in the lower triangle. Overwritten.
+    R are the rows (frames, points, 3, n); the information (frames, n, n) of the unknowns is valid
+    in the lower triangle, and overwritten.
     """
     frames, points, _, size = rows.shape
     spread = np.empty((frames, points, 3, 3))

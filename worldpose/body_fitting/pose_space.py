@@ -146,10 +146,7 @@ _LIMBS: Final = (
 
 
 def interpolate_gaps(joints: Floats) -> Floats:
-    """Return joints (frames, joints, 3) without gaps: linear between observations, constant beyond.
-
-    A joint that is never seen stays NaN.
-    """
+    """Return joints (frames, joints, 3) without gaps: linear, constant beyond; NaN if not seen."""
     full = joints.copy()
     frames = np.arange(len(joints))
     for joint in range(joints.shape[1]):
@@ -180,9 +177,8 @@ def nearest_matrices(matrices: Floats) -> Floats:
 def align_root(rest: Floats, torso: Floats) -> tuple[Floats, Floats]:
     """Return orientation (frames, 3, 3) and position of `rest`'s mean (frames, 3) [m].
 
-    Args:
-        rest: (4, 3) [m], shoulders and hips of the unposed body.
-        torso: (frames, 4, 3) [m], world; NaN points do not count.
+    `rest` (4, 3) [m] are shoulders and hips of the unposed body; NaN of `torso` (frames, 4, 3) [m],
+    world, do not count.
     """
     seen = np.asarray(np.isfinite(torso[..., 0]))
     weight = seen / np.maximum(seen.sum(-1, keepdims=True), 1)
@@ -210,11 +206,8 @@ def start_poses(
 ) -> tuple[Floats, Floats, Floats]:
     """Return `transl` (frames, 3), `global_orient` (frames, 3) and coordinates of the prior.
 
-    Args:
-        model: the body.
-        betas: (shapes,).
-        joints: (frames, 17, 3) [m], world, without gaps; a joint never seen is NaN.
-        prior: pose of limbs that no frame shows, and the bending direction of straight ones.
+    Betas are (shapes,), joints (frames, 17, 3) [m], world, without gaps; one never seen is NaN. The
+    prior has the pose of limbs that no frame shows, and the bending direction of straight ones.
     """
     rest = model.joint_template + model.joint_directions @ betas
     torso = rest[[16, 17, 1, 2]]
@@ -255,9 +248,8 @@ def start_poses(
 def level_feet(rotations: Floats, clear: Floats) -> Floats:
     """Return rotations of feet relative to their shanks (frames, 3, 3): flat where they stand.
 
-    Args:
-        rotations: (frames, 3, 3) rotations of the shank, world.
-        clear: (frames,) [m], height of the ankle above that of a flat foot.
+    Shanks have rotations (frames, 3, 3), world; `clear` (frames,) [m] is the height of the ankle
+    above that of a flat foot.
     """
     forward = rotations[..., 2].copy()
     forward[..., 2] = 0.0
@@ -283,11 +275,10 @@ SPREAD_TERMS: Final = {size: _spread_terms(spread) for size, spread in SPREADS.i
 
 
 def differentiate_points(pose: Floats, size: int) -> Floats:
-    """Return derivatives of points by the unknowns (frames, points, 3, 6 + size).
+    """Return derivatives (frames, points, 3, 6 + size) of points by the unknowns.
 
-    Args:
-        pose: (frames, points, 3, 72), by the angles of all joints.
-        size: number of coordinates of the pose.
+    `pose` (frames, points, 3, 72) are those by the angles of all joints, `size` counts its
+    coordinates.
     """
     angle, coordinate, factor = SPREAD_TERMS[size]
     return _gather_angles(pose, 3 + angle, 6 + coordinate, factor, 6 + size)

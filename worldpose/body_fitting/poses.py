@@ -101,10 +101,8 @@ class PoseSolver:
     def plant_feet(self, pose: Pose, seen: NDArray[np.bool_] | None = None) -> BodyParameters:
         """Return the bodies of a pose, with feet that are near the ground turned level with it.
 
-        Args:
-            pose: the pose.
-            seen: (frames, 2), whether points of the left and right foot determine its pose, which
-                then stays; None = neither.
+        If points of a foot, left or right, determine its pose, `seen` (frames, 2), it stays; None =
+        neither.
         """
         parameters = pose.parameters()
         if self.ground is None:
@@ -171,12 +169,7 @@ def pose_covariance(
     The covariance (frames, points, 3, 3) [m^2] is that of the poses. Errors last for about
     `noise_time_s`, so that a frame of the track has that much less weight. Where a point moves too
     freely to gain from other frames, its own frame alone determines it, with all its weight: the
-    smaller of both covariances is that of a point.
-
-    Args:
-        objective: that of the track, with its standing ankles.
-        pose: its poses.
-        offsets: (17, 3) [m], the detector's offsets.
+    smaller of both covariances is that of a point. `offsets` (17, 3) [m] are the detector's.
     """
     equations = damp_motion(objective).equations(pose, offsets, bordered=False)
     body = equations.points
@@ -199,11 +192,7 @@ def _damp(blocks: Floats) -> Floats:
 
 
 def factor(blocks: Floats) -> BandedFactor:
-    """Return the factor of blocks with a little damping, which overwrites the blocks.
-
-    Raises:
-        DegenerateError: rounding leaves no positive definite system.
-    """
+    """Return the factor of slightly damped blocks, overwritten; DegenerateError by rounding."""
     solved = BandedFactor.of(_damp(blocks), overwrite=True)
     if not solved.determined:
         raise DegenerateError(

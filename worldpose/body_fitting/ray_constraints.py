@@ -105,10 +105,8 @@ def _lone_rays(
 def lines_of_sight(origins: Floats, directions: Floats, expected: Floats) -> RayConstraints:
     """Return rays as lines of sight, parallel per person and frame.
 
-    Args:
-        origins: (frames, persons, 17, 3) [m], world.
-        directions: (frames, persons, 17, 3), of any length; NaN without a ray.
-        expected: (frames, persons, 17, 3) [m], world, approximate joints.
+    Origins, expected (approximate) joints [m], world, and directions, of any length or NaN without
+    a ray, are (frames, persons, 17, 3).
     """
     points, across = np.full(directions.shape, np.nan), np.zeros((*directions.shape, 3))
     # Most people have none: their arrays are not computed.
@@ -145,12 +143,9 @@ def expected_joints(joints: Floats) -> Floats:
 def identify_people(camera: Camera, keypoints: NDArray[np.floating], joints: Floats) -> Floats:
     """Return the keypoints (frames, persons, 17, 2) [px] of known people; NaN where not seen.
 
-    The assignment minimizes the mean distances to projected joints, frame by frame.
-
-    Args:
-        camera: batch (frames,).
-        keypoints: (frames, detections, 17, 2) [px]; NaN where not found.
-        joints: (frames, persons, 17, 3) [m], world, at the times of the images.
+    The assignment minimizes the mean distances to projected joints, frame by frame. The camera is
+    (frames,), keypoints are (frames, detections, 17, 2) [px], NaN where not found, and joints
+    (frames, persons, 17, 3) [m], world, at the times of the images.
     """
     frames, persons = joints.shape[:2]
     image = camera.project(joints.reshape(frames, -1, 3)).reshape(frames, persons, 17, 2)
@@ -176,12 +171,10 @@ def identify_people(camera: Camera, keypoints: NDArray[np.floating], joints: Flo
 
 
 def constrain_to_rays(camera: Camera, keypoints: Floats, joints: Floats) -> RayConstraints:
-    """Return the lines of sight of joints in a moving camera.
+    """Return the lines of sight of joints in a moving camera (frames,), at points near the joints.
 
-    Args:
-        camera: batch (frames,).
-        keypoints: (frames, persons, 17, 2) [px] of each person; NaN where not seen.
-        joints: (frames, persons, 17, 3) [m], world; the lines' points are the nearest to these.
+    Keypoints are (frames, persons, 17, 2) [px] of each person, NaN where not seen, and joints
+    (frames, persons, 17, 3) [m], world.
     """
     frames, persons = joints.shape[:2]
     rays = camera.unproject(keypoints.reshape(frames, -1, 2))

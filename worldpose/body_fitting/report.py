@@ -44,9 +44,7 @@ class BodyFittingReport(Record):
 class FitMetrics:
     """Metrics of consecutive parts of a clip, whose memory does not grow with the clip.
 
-    Args:
-        fps: [1/s].
-        stride: of this many values of a part, medians and spreads use one.
+    Of `stride` values of a part, medians and spreads use one.
     """
 
     def __init__(self, fps: float, stride: int = 1) -> None:
@@ -59,13 +57,10 @@ class FitMetrics:
     def add(
         self, fit: BodyFit, joints: Floats, seen: tuple[Camera, TrackedFrames] | None = None
     ) -> None:
-        """Add the next frames.
+        """Add the next frames' bodies, with the joints (frames, persons, 17, 3) [m] of the fit.
 
-        Args:
-            fit: bodies of these frames.
-            joints: (frames, persons, 17, 3) [m], world, input of the fit.
-            seen: static cameras (cameras,), or each frame's camera (frames, 1), and the detections
-                behind the joints, left-right swaps undone.
+        `seen` are static cameras (cameras,), or each frame's camera (frames, 1), and the detections
+        behind the joints, left-right swaps undone.
         """
         self._offsets, self._persons = fit.offsets, joints.shape[1]
         self._counts += (
@@ -127,14 +122,7 @@ class FitMetrics:
 def report_fit(
     fit: BodyFit, joints: Floats, fps: float, seen: tuple[Camera, KeypointDetections] | None = None
 ) -> BodyFittingReport:
-    """Return the metrics of a fit.
-
-    Args:
-        fit: bodies of one clip.
-        joints: (frames, persons, 17, 3) [m], world, input of the fit.
-        fps: [1/s].
-        seen: cameras and detections as of `FitMetrics.add`.
-    """
+    """Return the metrics of one clip's fit; arguments as of `FitMetrics.add`."""
     metrics = FitMetrics(fps)
     metrics.add(fit, joints, seen)
     return metrics.report()
@@ -174,17 +162,11 @@ def _spread(lengths: AnyFloats) -> float | None:
 
 
 def far_offsets(offsets: Floats, common_bias: Floats) -> dict[str, tuple[float, float]]:
-    """Return the joints of bodies with unusually large offsets.
+    """Return the joints of bodies with unusually large offsets (17, 3) [m].
 
     Shape and offsets together follow the detector: an offset much larger than a detector's common
-    bias means that either the joints or the bodies are wrong.
-
-    Args:
-        offsets: (17, 3) [m], of joints of bodies.
-        common_bias: (17,) per axis [m]; 0 = not known.
-
-    Returns:
-        By joint, left and right as one: length of the offset and its usual maximum [m].
+    bias (17,) per axis [m], 0 = not known, means that either the joints or the bodies are wrong.
+    Returned are, left and right as one, length of the offset and its usual maximum [m].
     """
     length = np.linalg.norm(offsets, axis=-1)
     # Standard deviations that one of the nine joints exceeds by chance in one clip of a thousand:

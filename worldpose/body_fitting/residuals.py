@@ -143,11 +143,9 @@ class PersonObjective:
     ) -> NormalEquations:
         """Return the normal equations at a pose: of all terms but E_shape and E_offset.
 
-        Args:
-            pose: where to linearise.
-            offsets: (17, 3) [m] forward, left, up, from a body's joints to the detector's.
-            bordered: whether the equations have a border for betas and offsets.
-            points: those of the pose with their derivatives, if they are known.
+        Offsets (17, 3) [m] forward, left, up, are from a body's joints to the detector's. If
+        `bordered`, the equations have a border for betas and offsets. `points` are those of the
+        pose with their derivatives, if they are known.
         """
         given, body = self.settings, points or self.differentiate(pose, by_betas=bordered)
         frames, count = body.keypoints.shape[:2]

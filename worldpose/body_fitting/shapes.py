@@ -61,12 +61,9 @@ def fit_shapes(
 ) -> Shapes:
     """Return betas and the detector's offsets of people with triangulated joints.
 
-    Args:
-        solver: body, prior, settings and ground.
-        people: joints (frames, 17, 3) [m] and covariance (frames, 17, 3, 3) [m^2] of each, in
-            intervals as `spread_intervals` chooses.
-        known: shapes of some persons from other clips; the others start from the prior.
-        fps: [1/s].
+    Joints (frames, 17, 3) [m] have a covariance (frames, 17, 3, 3) [m^2], in intervals as
+    `spread_intervals` chooses. Persons without a known shape, from other clips, start from the
+    prior.
     """
 
     def sample(person: int) -> Piece | None:

@@ -24,11 +24,8 @@ def pose_skeletons(joints: Floats, fps: float) -> tuple[Floats, Floats]:
     """Return the rotations of the pelvis (frames, 3) and of the other joints (frames, 69) [rad].
 
     They are those of a mean body in the axes of the joints, without ground. Frames without joints
-    are filled by motion.
-
-    Args:
-        joints: (frames, 17, 3) [m], COCO-17, about any origin; NaN where missing.
-        fps: frames per second [1/s].
+    are filled by motion. Joints (frames, 17, 3) [m], COCO-17, are about any origin; NaN where
+    missing.
     """
     model, settings = load_open_body(), BodyFittingSettings()
     keypoints = ChainedKeypoints.of(fold_keypoints(model, COCO17))

@@ -46,13 +46,9 @@ def find_standing_distance(
 ) -> tuple[Floats, Floats]:
     """Return the distance of a person (frames,) [m], and its variance (frames,) [m^2].
 
-    Args:
-        distance: (frames,) [m], at which the lower ankle would stand; NaN where unknown.
-        slope: (frames,) fall of the line of sight per horizontal metre [1].
-        fps: frames per second [1/s].
-        height_std_m: standard deviation of a standing ankle's height [m].
-        place: (frames,) [m], the distance that is given.
-        information: (frames,) [1/m^2], inverse variance of `place`; 0 where unknown.
+    At `distance` (frames,) [m], NaN where unknown, the lower ankle would stand, at a height of a
+    deviation [m]; `slope` (frames,) [1] is the fall of the line of sight per horizontal metre.
+    `place` (frames,) [m] is given, with information (frames,) [1/m^2], 0 where unknown.
     """
     motion, frames = Motion.at(fps), len(distance)
     known = np.isfinite(distance)

@@ -273,10 +273,7 @@ def _refit_as_paper(
     problem: ClipProblem,
     settings: BroadcastCalibrationSettings,
 ) -> ClipSolution:
-    """Return the camera of least E_calib, the fit with `method=paper`.
-
-    It starts from tracking, whose projections are the markings' initial positions.
-    """
+    """Return the camera of least E_calib, the fit with `method=paper`, from that of tracking."""
     require_torch()
     from worldpose.reference_method.broadcast_calibration import refine
 
@@ -304,8 +301,7 @@ def _report_given(
 ) -> BroadcastReport:
     """Return a report with the comparison of the camera and its camera data.
 
-    Raises:
-        InputError: the camera rests on the data alone, and the paint does not confirm them.
+    InputError if the camera rests on the data alone, and the paint does not confirm them.
     """
     confirmed = float(np.mean(report.marking_count >= 30))
     if given.leads and (confirmed < 0.5 or denied):
@@ -353,12 +349,8 @@ def _fit_and_learn(
 ) -> tuple[ClipProblem, ClipSolution, LearnedNoise]:
     """Return fits that alternate with the spreads that their residuals show, until these settle.
 
-    Args:
-        points: evidence of the assumed noise.
-        camera: initial camera.
-        learned: spreads so far.
-        start: the terms that no spread changes, without points.
-        iterations: maximum solver iterations of one fit.
+    `points` have the assumed noise, `learned` are the spreads so far, and `start` has the terms
+    that no spread changes, without points. One fit has so many iterations at most.
     """
     for left in reversed(range(4)):
         weights = start.weights._replace(flow=start.weights.flow / learned.lasting)
@@ -390,11 +382,7 @@ def _select_flow(
 
 
 def _keep_frames(clip: BroadcastClip, wanted: set[int], kept: dict[int, Image]) -> Iterator[Image]:
-    """Yield all frames, and store the wanted ones in `kept`.
-
-    Raises:
-        InputError: people, boxes or camera data have other frames than the pictures.
-    """
+    """Yield all frames, and keep the wanted ones; InputError if people or data have others."""
     given = set() if clip.boxes is None else {len(clip.boxes)}
     given |= set() if clip.people is None else {len(clip.people.joints)}
     given |= set() if clip.given is None else {len(clip.given.values)}

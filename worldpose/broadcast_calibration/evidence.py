@@ -96,14 +96,8 @@ class PointEvidence:
     ) -> PointEvidence:
         """Return evidence of places without survey error and with a known size of the pitch.
 
-        Args:
-            kind: CLICK, MARKING or PLAYER.
-            frame: (n,) rising.
-            world: (n, 3) [m], world.
-            image: (n, 2) [px].
-            whitening: (n, 2, 2) [1/px], see `whiten_across` and `whiten_points`.
-            source: (n,) index of the marking or person; None = clicks.
-            loss: scale of the loss [standard deviations].
+        Arguments are as the attributes, the loss one for all; `whitening` is of `whiten_across` or
+        `whiten_points`, and `source` None is that of clicks.
         """
         count = len(frame)
         return cls(

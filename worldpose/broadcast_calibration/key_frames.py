@@ -75,17 +75,9 @@ def propose_key_frames(
     """Return key frames proposed from images of a clip, without a click.
 
     Only clear proposals count, and only those that agree on the center with most of the others.
-
-    Args:
-        pictures: numbers of frames, and their images (height, width, 3) RGB.
-        pitch: the stadium's template.
-        side: where the camera stands; None = the people decide.
-        where: clip or file, for messages.
-        people: people whose places are known; they decide the side, or confirm it.
-
-    Raises:
-        InputError: fewer than two frames have a clear proposal with one center; the people do not
-            decide the side, or contradict the stated one.
+    Images (height, width, 3) RGB have numbers of frames. If `side` of the camera is None, people of
+    known places decide it; else they confirm it. InputError if fewer than two frames have a clear
+    proposal with one center, or people do not decide the side, or contradict the stated one.
     """
     min_proposals = 2
     clear, seen = [], 0
@@ -127,9 +119,8 @@ def must_turn(
 ) -> bool:
     """Return whether the people stand where they are only after half a turn of the cameras.
 
-    Raises:
-        InputError: the people do not decide the side that is not stated, or contradict a stated
-            one, which camera data state, too.
+    InputError if the people do not decide the side that is not stated, or contradict a stated one,
+    which camera data state, too.
     """
     same, turned = (0.0, 0.0) if people is None else _compare_people(cameras, pitch, people)
     if side is None and abs(same - turned) < MIN_EVIDENCE:
@@ -209,10 +200,8 @@ def calibrate_keys(
     """Return the key frames' cameras with one center and principal point.
 
     The images (height, width) are grey; frames without one use their clicks alone. Key frames have
-    the numbers of the video, whose frame `first` is the clip's first.
-
-    Raises:
-        InputError: no key frame is usable; the message gives the reason for each.
+    the numbers of the video, whose frame `first` is the clip's first. InputError, with the reason
+    for each, if no key frame is usable.
     """
     clicked = {key.frame - first: key for key in sorted(key_frames, key=lambda each: each.frame)}
     found, refused = _calibrate_each(pitch, clicked, image_size, settings, where)

@@ -42,10 +42,9 @@ class MovingCamera:
 
     @classmethod
     def of(cls, camera: Camera, center: ArrayLike, principal_point: ArrayLike) -> MovingCamera:
-        """Return a batch (frames,) with another center [m] and principal point [px].
+        """Return a batch (frames,) of this center [m] and principal point [px], with Brown's lens.
 
-        Raises:
-            InputError: its lens is not of Brown's model.
+        InputError if its lens is not of Brown's model.
         """
         others = set(np.unique(camera.lens_model).tolist()) - {LensModel.BROWN.value}
         if others:

@@ -57,13 +57,10 @@ class People:
 
     @classmethod
     def in_images(cls, joints: Floats, keypoints: Floats, fps: float, clock: ImageClock) -> People:
-        """Return people in every image of a moving camera, with joints at its time.
+        """Return people in every image of a moving camera with a clock, with joints at its time.
 
-        Args:
-            joints: (frames, persons, 17, 3) [m], world, at match frames.
-            keypoints: (frames, detections, 17, 2) [px] in the image of each match frame.
-            fps: match frames per second.
-            clock: the images.
+        Joints (frames, persons, 17, 3) [m], world, are at match frames, keypoints (frames,
+        detections, 17, 2) [px] in the image of each.
         """
         seen = np.full((len(clock.images), *keypoints.shape[1:]), np.nan)
         seen[clock.image_row] = keypoints
@@ -111,11 +108,9 @@ class Matches:
 
 @dataclass(frozen=True)
 class PlayerNoise:
-    """Keypoint noise, estimated from the residuals of matched players.
+    """Keypoint noise of matched players, relative to the person's height in the image [1].
 
-    Attributes:
-        share: standard deviation of a keypoint, relative to the person's height in the image [1].
-        frames: number of successive frames worth one independent frame [frame].
+    So many successive frames are worth one independent frame [frame].
     """
 
     share: float

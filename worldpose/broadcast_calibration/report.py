@@ -79,12 +79,9 @@ class BroadcastReport:
 
 @dataclass(frozen=True, eq=False)
 class TrackedClip:
-    """A clip before refinement: its key frames, and the chain of cameras between them.
+    """A clip before refinement: its key frames, an initial camera for every frame between them.
 
-    Attributes:
-        keys: calibrated key frames.
-        chain: an initial camera for every frame.
-        flow: followed points consistent with the chain.
+    `flow` are followed points consistent with the chain of these cameras.
     """
 
     keys: Keys
@@ -100,7 +97,6 @@ class JointFit:
         camera: all frames.
         before: all frames before players and the joint fit.
         uncertainty: covariance of `camera`.
-        points: evidence of the fit.
         matches: players; None without.
         weights: weights of the terms.
         feed_offset: the clip's clock offset; None without people.
@@ -344,12 +340,9 @@ def median_residuals(camera: MovingCamera, points: PointEvidence) -> tuple[float
 
 @dataclass(frozen=True, eq=False)
 class BroadcastCalibration:
-    """A moving camera, its covariance and its report.
+    """A moving camera, its covariance and its report: residuals, drift, frames to click next.
 
     Attributes:
-        camera: all frames.
-        uncertainty: its covariance.
-        report: residuals, drift, frames to click next.
         tracked: camera from key frames and followed points alone, before any refinement.
         before: `tracked` with rotation and focal length of each frame corrected on its painted
             lines, before players and the joint fit.
@@ -391,11 +384,7 @@ def broadcast_attributes(
 ) -> dict[str, Any]:
     """Return the stored attributes of a calibrated clip, with frame numbers of its video.
 
-    Args:
-        clip_id: the clip.
-        calibration: its camera.
-        first: number of its first frame in its video.
-        rate: frames of the video per match frame.
+    The video's number of the first frame is `first`, its frames per match frame are `rate`.
     """
     report, offset = calibration.report, calibration.report.feed_offset
     keys = report.pitch.keys

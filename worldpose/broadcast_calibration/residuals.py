@@ -55,12 +55,7 @@ _MAX_LOSS: Final = 1e12
 
 @dataclass(frozen=True, eq=False)
 class ClipEquations:
-    """The objective, its gradient and its Gauss-Newton matrix at one camera.
-
-    Attributes:
-        cost: half the sum of losses and squares.
-        system: matrix and gradient.
-    """
+    """The objective, half the sum of losses and squares, with matrix and gradient at a camera."""
 
     cost: float
     system: ArrowSystem
@@ -396,10 +391,7 @@ def flow_row(
     """Write the pixel in the second of two frames of a point in the first, and derivatives (2, 16).
 
     The point is a direction from the center, which both frames share. Derivatives are by the first
-    frame's step, the second's, and the principal point.
-
-    Returns:
-        Whether the pixel exists.
+    frame's step, the second's, and the principal point. Return whether the pixel exists.
     """
     focal = before.fx
     xd, yd = (start_u - before.cx) / focal, (start_v - before.cy) / focal
@@ -447,10 +439,7 @@ def _add_flow(
     term_weight: float,
     system: ArrowSystem,
 ) -> float:
-    """Add followed points to the normal equations and return their cost; see `_add_points`.
-
-    Points `edges[t]` to `edges[t + 1]` begin in frame t.
-    """
+    """Add followed points from frame t, `edges[t]` to `edges[t + 1]`, and return their cost."""
     blocks, border, corner = system.blocks, system.border, system.corner
     right, right_corner = system.right, system.right_corner
     cost = 0.0

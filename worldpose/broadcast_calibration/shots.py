@@ -74,12 +74,8 @@ def find_shots(pictures: Iterable[tuple[int, Image | None]], fps: float) -> Iter
     """Yield the shots of a programme in order, each with the reasons to reject it.
 
     One pass in bounded memory. Simple features select shots of the main camera: grass, the size of
-    people, a pan, and the wipes about replays; a person confirms the selection.
-
-    Args:
-        pictures: numbers, rising by one, and small RGB frames, about 320 px wide; None for a
-            damaged frame, which ends a shot.
-        fps: frames per second.
+    people, a pan, and the wipes about replays; a person confirms the selection. Numbers rise by
+    one, with small RGB frames, about 320 px wide; None for a damaged frame, which ends a shot.
     """
     min_shot_s = 1.0  # shorter parts belong to a transition between two shots
     # The stride limits the accuracy of cuts.
@@ -185,13 +181,9 @@ def _shot(course: _Course, before: int | None, after: int | None, fps: float, st
 def require_one_shot(
     followed: Sequence[Followed], share: float, where: str, first: int = 0
 ) -> None:
-    """Raise InputError if a clip has several shots.
+    """Raise InputError, with their frames' numbers in the video, if a clip has cuts.
 
-    A new one begins where less than a share of points is followed.
-
-    Raises:
-        InputError: the clip has cuts; the message lists their frames, by their numbers in the
-            video.
+    A new shot begins where less than a share of points is followed.
     """
     cuts = [number + 1 for number, pair in enumerate(followed) if pair.inlier_share < share]
     if cuts:

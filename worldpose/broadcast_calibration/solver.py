@@ -50,10 +50,9 @@ class ClipSolution:
 
 
 def solve(camera: MovingCamera, problem: ClipProblem, iterations: int) -> ClipSolution:
-    """Return the camera of least cost near a start.
+    """Return the camera of least cost near a start; DegenerateError if the matrix is singular.
 
-    Raises:
-        DegenerateError: the matrix is singular: a parameter has neither evidence nor prior.
+    A parameter then has neither evidence nor prior.
     """
 
     def step(state: ClipSolution, damping: float) -> ClipSolution:
@@ -74,11 +73,7 @@ def solve(camera: MovingCamera, problem: ClipProblem, iterations: int) -> ClipSo
 
 
 def factorize(system: ArrowSystem, damping: float = 0.0) -> ArrowFactor:
-    """Return the factor of a system.
-
-    Raises:
-        DegenerateError: the matrix is singular.
-    """
+    """Return the factor of a system; DegenerateError if its matrix is singular."""
     factor = ArrowFactor.of(system, damping)
     if not factor.determined:
         raise DegenerateError(

@@ -31,11 +31,9 @@ from worldpose.geometry.optimize.losses import geman_mcclure_weight
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """Covariance of a moving camera.
+    """Covariance (frames, 12, 12) of a moving camera: of a frame's step and the clip's jointly.
 
-    Attributes:
-        frame: (frames, 12, 12) joint covariance of a frame's step and the clip's; 0 for fixed
-            parameters.
+    It is 0 for fixed parameters.
     """
 
     frame: Floats
@@ -100,22 +98,12 @@ def compute_uncertainty(
     marking or of a person lasts for the whole clip and does not average out: the function
     propagates the remaining gradient of each such source to the solution and adds it, which makes
     the covariance too large by a factor of two without such errors. A shift of all lines in the
-    image, or of all keypoints of all people, leaves no gradient, since the camera follows it: the
+    image, `line_shift` along each axis [px], or of all keypoints of all people, `player_shift`
+    along each axis [deviations of a keypoint], leaves no gradient, since the camera follows it: the
     function propagates such shifts by their given size. The same applies to correlated second
     differences of the lens: a zoom lasts for many frames, and their errors are correlated over
-    them. Fixed parameters of the problem count as exact.
-
-    Args:
-        solution: the camera and the paint errors.
-        problem: evidence, smoothness and priors of the solution.
-        line_shift: standard deviation of a common shift of all painted lines in the image, each
-            axis [px].
-        player_shift: standard deviation of a common shift of all keypoints in all frames, each axis
-            [standard deviations of a keypoint].
-        smooth_frames: correlation time of the lens's second differences [frame].
-
-    Raises:
-        DegenerateError: the system is singular.
+    `smooth_frames` of them. Fixed parameters of the problem count as exact. DegenerateError if the
+    system is singular.
     """
     factor = factorize(solution.equations.system)
     frames, _, count = factor.border.shape
@@ -169,11 +157,7 @@ def _cells(points: PointEvidence) -> Integers:
 
 
 def paint_variance(solution: ClipSolution) -> Floats:
-    """Return the posterior variance (painted, 3) of a solution's paint errors [std^2].
-
-    Raises:
-        DegenerateError: the system is singular.
-    """
+    """Return the posterior variance (painted, 3) of a solution's paint errors [std^2]."""
     covariance = factorize(solution.equations.system).shared_covariance()
     return np.asarray(covariance.diagonal()[CLIP_SIZE:].reshape(-1, 3))
 

@@ -112,8 +112,7 @@ class Adjuster:
     def find_objection(self, before: HeldOutErrors, after: HeldOutErrors, fixed: Flags) -> str:
         """Return the reason to refuse the whole change; empty without one.
 
-        Cameras with their own covariance, in a rig of more than `_SMALL_RIG`, need only
-        `judge_cameras`.
+        Cameras with their own covariance, in a rig above `_SMALL_RIG`, need only `judge_cameras`.
         """
         changed = ~fixed
         given = self.clip.given & changed
@@ -247,10 +246,7 @@ def place_people(clip: Clip, frames: Integers) -> Floats:
 
 
 def _select_observations(observed: Observations, kept: Flags) -> Observations:
-    """Return the observations (n,) that are kept, with renumbered points.
-
-    A point left with a single observation carries no information and is dropped.
-    """
+    """Return the observations (n,) that are kept, renumbered, without points of a single one."""
     kept = kept & (
         np.bincount(observed.point_of[kept], minlength=len(observed.points))[observed.point_of] > 1
     )

@@ -146,10 +146,7 @@ class Clip:
 
 
 class Observations(NamedTuple):
-    """Keypoints of some people in some frames, sorted by point.
-
-    A point is one joint of one person in one frame.
-    """
+    """Keypoints of people in frames, sorted by point: one joint of one person in one frame."""
 
     points: Floats
     """(points, 3) [m], world, as triangulated."""
@@ -237,15 +234,9 @@ def project_joints(
 ) -> tuple[Floats, Floats]:
     """Return projections of joints, and the standard deviation of keypoints there per axis [px].
 
-    Args:
-        cameras: (cameras,) batch.
-        joints: (frames, persons, 17, 3) [m], world.
-        confidence: (frames, cameras, persons, 17).
-        settings: settings of triangulation, with the stated noise.
-
-    Returns:
-        (frames, cameras, persons, 17, 2) and (frames, cameras, persons, 17); NaN and infinite
-        without an image.
+    Of a batch (cameras,), joints (frames, persons, 17, 3) [m], world, and confidence (frames,
+    cameras, persons, 17), they are (frames, cameras, persons, 17, 2) and (frames, cameras, persons,
+    17). They are NaN and infinite without an image. The settings have the stated noise.
     """
     count = len(cameras.focal)
     shape = (count, *joints.shape[:3])
@@ -269,14 +260,8 @@ def propose_frames(
 
     Each frame adds keypoints of joints with enough views to cells of the pitch, per camera; further
     keypoints of a cell have diminishing value (the sum of logarithms). A greedy search takes the
-    frame that adds most, `gap` away from those before.
-
-    Args:
-        clip: cameras, joints and their detections.
-        count: maximum number of frames.
-        gap: minimum time between two of them [s].
-        min_views: minimum inlier cameras of a joint.
-        taken: (k,) indices to exclude.
+    frame that adds most, `gap` [s] away from those before, up to `count` and without those `taken`
+    (k,).
     """
     offered = _count_keypoints(clip, min_views)
     left: Flags = np.asarray(offered.any(axis=1))

@@ -50,12 +50,12 @@ class CamerasFromPeople:
 
     Attributes:
         cameras: (cameras,) batch.
-        std: (cameras, 3) standard deviation of position [m], orientation [rad] and the logarithm
-            of the focal length [1], relative to the other cameras and the people.
+        std: (cameras, 3) standard deviation of position [m], orientation [rad] and the logarithm of
+            the focal length [1], relative to the other cameras and the people.
         scale_std: relative standard deviation of all lengths [1].
         up_std: standard deviation of the vertical, the larger of two axes [rad].
         on_feet: whether standing feet determine the vertical; else people are assumed upright.
-        stature_m: stature of the people by the limbs, median [m].
+        stature_m: median stature of the people by the limbs [m].
         people: number of people [1].
         keypoints: (cameras,) keypoints used [1].
         residual_px: (cameras,) median distance of a keypoint from its joint [px].
@@ -98,19 +98,13 @@ def locate_cameras(
 ) -> CamerasFromPeople:
     """Return static cameras by the 2D poses of people who walk, all in one metric world.
 
-    Args:
-        lenses: lens of each camera. Focal length and principal point are adjusted within their
-            deviations; where the focal length is known to 10 % or less, several are tried.
-        detections: (frames, cameras, detections) in memory, before tracking, on a common clock.
-        fps: frames per second [1/s].
-        known: length that gives the scale.
+    Focal length and principal point of each lens are adjusted within their deviations; where the
+    focal length is known to 10 % or less, several are tried. Detections (frames, cameras,
+    detections) are in memory, before tracking, on a common clock; `known` gives the scale. The
+    relative pose is by the five-point algorithm (Nister, IEEE PAMI 26(6), 2004).
 
-    Raises:
-        InputError: fewer than two cameras, people stand still, two cameras show no person together
-            for long enough, or the people do not determine a camera; the error names it.
-
-    Note:
-        Five-point algorithm: Nister, IEEE PAMI 26(6), 2004.
+    InputError for fewer than two cameras, people who stand still, two cameras that show no person
+    together for long enough, or people who do not determine a camera, which the error names.
     """
     max_std = 0.1  # by the distance from the people
     names = [lens.id for lens in lenses]

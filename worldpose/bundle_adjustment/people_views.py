@@ -61,8 +61,7 @@ def find_walkers(
 ) -> list[list[Floats]]:
     """Return the keypoints (frames, 12, 2) [px] of the people in each camera's images.
 
-    Raises:
-        InputError: a camera shows no person for long enough, or no person walks.
+    InputError if a camera shows no person for long enough, or no person walks.
     """
     min_motion = 0.25
     every = []
@@ -112,10 +111,7 @@ def _height(track: Floats) -> float:
 
 
 def _walking_distance(track: Floats) -> float:
-    """Return the distance that a person moves in the image, in heights of the person [1].
-
-    A change of size counts as motion: that person walks towards the camera.
-    """
+    """Return how far a person moves or changes in size in the image, in the person's heights."""
     seen = track[_frames(track)]
     middle = np.nanmean(seen, axis=1)
     tall = np.nanmax(seen[..., 1], axis=1) - np.nanmin(seen[..., 1], axis=1)
@@ -179,8 +175,7 @@ class Views:
     def starts(self) -> list[Start]:
         """Return the cameras from the best pairs.
 
-        Raises:
-            InputError: no two cameras show one person, or one shares no person with the others.
+        InputError if no two cameras show one person, or one shares no person with the others.
         """
         pairs = [self._pair(a, b) for a, b in combinations(range(len(self.names)), 2)]
         good = sorted((one for one in pairs if one is not None), key=lambda one: -one.worth)
@@ -453,10 +448,8 @@ def adjust_poses(
     """Return cameras and joints adjusted to the keypoints, or the joints alone.
 
     The first camera stays where it is, and the second one at its distance: no keypoint tells the
-    world frame. Lenses are the prior of focal lengths and principal points.
-
-    Raises:
-        InputError: the keypoints do not determine the cameras.
+    world frame. Lenses are the prior of focal lengths and principal points. InputError if the
+    keypoints do not determine the cameras.
     """
     fixed_information = 1e12  # a step of a micrometre costs one [1/m^2]
     count = len(lenses)

@@ -24,15 +24,9 @@ from worldpose.triangulation.estimate import triangulate_frames
 def adjustment_arrays(
     adjusted: BundleAdjustment, settings: BundleAdjustmentSettings, person: NDArray[np.integer[Any]]
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Return the stored arrays and attributes of adjusted cameras, without the people.
+    """Return the stored arrays and attributes by name of adjusted cameras, without the people.
 
-    Args:
-        adjusted: the adjustment.
-        settings: settings of the adjustment.
-        person: (persons,) ids.
-
-    Returns:
-        Arrays by name, and attributes by name, except the camera ids.
+    Camera ids are no such attribute; `person` (persons,) are ids.
     """
     clip = adjusted.clip
     outliers = keypoint_outliers(
@@ -84,10 +78,7 @@ def adjustment_arrays(
 
 
 def marking_errors(clip: Clip, cameras: Camera) -> Floats:
-    """Return the root mean square error per axis (cameras,) [px] of clicks used in calibration.
-
-    It is NaN for cameras without such clicks.
-    """
+    """Return root mean square errors per axis (cameras,) [px] of clicks of calibration, or NaN."""
     errors = np.full(len(clip.clicks), np.nan)
     for c, clicks in enumerate(clip.clicks):
         if clicks.inlier.any():
@@ -142,10 +133,7 @@ class ClickReview:
 def keypoint_outliers(
     clip: Clip, cameras: Camera, noise: KeypointNoise, limit: float, longest: int
 ) -> KeypointOutliers:
-    """Return the keypoints that disagree with the joints from all cameras, the worst first.
-
-    They are those beyond a Mahalanobis distance; the list has a maximum length.
-    """
+    """Return keypoints beyond a Mahalanobis distance of all cameras' joints, the worst first."""
     block = 256  # frames at a time: limits the memory, not the result
     last = len(clip.frame)
 
@@ -187,13 +175,8 @@ def review_clicks(
 
     The residual of a click that pulled its camera has the covariance s^2 - J C J^T, with the noise
     s that made C. Where little of s^2 remains, the click alone determines the camera, and no error
-    of it can be seen.
-
-    Args:
-        clicks: clicks of every camera.
-        cameras: (cameras,) batch.
-        covariance: (cameras, 12, 12) covariance of a step.
-        changed: (cameras,) bool, whether a camera differs from its calibration.
+    of it can be seen. Steps of a batch (cameras,) have the covariance (cameras, 12, 12); `changed`
+    (cameras,) is whether a camera differs from its calibration.
     """
     camera: list[int] = []
     name: list[str] = []

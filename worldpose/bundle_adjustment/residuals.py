@@ -140,14 +140,8 @@ def free_joints_problem(
 ) -> AdjustmentProblem:
     """Return the adjustment of cameras to joints without a prior of their places.
 
-    Args:
-        cameras: (cameras,) batch.
-        free: (cameras, 12) as in `AdjustmentProblem`.
-        information: (cameras, 12, 12), the prior of a step.
-        observed: joints and their pixels.
-        noise: scale and correlation of the keypoints' errors.
-        loss_scale: scale of Cauchy's loss [standard deviations].
-        names: names of the cameras.
+    Of a batch (cameras,), `free` is (cameras, 12) as in `AdjustmentProblem`, the prior of a step is
+    `information` (cameras, 12, 12). The scale of Cauchy's loss is in standard deviations.
     """
     variance = (observed.noise * noise.scale) ** 2 * noise.correlation
     return AdjustmentProblem(

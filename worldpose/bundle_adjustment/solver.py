@@ -37,16 +37,10 @@ def solve(
 ) -> AdjustmentSolution:
     """Return the cameras and points that fit all observations and priors best.
 
-    Args:
-        problem: cameras, points, observations and priors.
-        settings: when to stop.
-        offset: (cameras, 12) initial steps from the problem's cameras, such as the solution of a
-            similar problem; None = none.
-        covariance: whether to compute the cameras' covariance, which takes as long as half a step.
-
-    Raises:
-        InputError: a free point has fewer than two cameras, a point lies behind a camera that sees
-            it, or nothing fixes the cameras.
+    `offset` (cameras, 12) are initial steps from the problem's cameras, such as the solution of a
+    similar problem; None = none. The cameras' covariance takes as long as half a step. InputError
+    if a free point has fewer than two cameras, a point lies behind a camera that sees it, or
+    nothing fixes the cameras.
     """
     settings = settings or SolverSettings()
     _require_two_views(problem)

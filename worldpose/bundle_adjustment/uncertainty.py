@@ -77,21 +77,12 @@ def similarity_steps(cameras: Camera, origin: Floats) -> Floats:
 def relative_covariance(
     covariance: Floats, cameras: Camera, information: Floats, origin: Floats
 ) -> tuple[Floats, Floats]:
-    """Split the covariance of cameras into individual errors and a common error.
+    """Split the covariance of cameras (12 cameras, 12 cameras) into individual and common errors.
 
     The common part is the similarity transform that best explains the cameras' errors as pixels at
-    the people; the rest is relative.
-
-    Args:
-        covariance: (12 cameras, 12 cameras) covariance of steps.
-        cameras: (cameras,) batch.
-        information: (cameras, 12, 12) information of keypoints on each camera alone, used as its
-            weight.
-        origin: (3,) [m], world: position of the people.
-
-    Returns:
-        (cameras, 12, 12) of each camera's relative step, and (7, 7) of the transform's parameters
-        as in `similarity_steps`.
+    the people, whose position is `origin` (3,) [m], world; the rest is relative. A camera's weight
+    is the information of keypoints on it alone (cameras, 12, 12). Returned are (cameras, 12, 12) of
+    each relative step, and (7, 7) of the transform's parameters as in `similarity_steps`.
     """
     count, size = information.shape[:2]
     steps = similarity_steps(cameras, origin)
@@ -117,15 +108,10 @@ def survey_response(clip: Clip, survey_error: float) -> Floats:
     unknowns, and for the unknowns alone. Unknowns are the positions of the template's points, which
     cameras share, and a shift of each marking in the image, which each camera has on its own. The
     lines are those that the camera sees. Clicks are left out, because their errors are far larger
-    than those of the survey.
+    than those of the survey, a deviation of the template's points along each axis [m].
 
-    Args:
-        clip: cameras, their covariance, the pitch, and the cameras calibrated on its lines.
-        survey_error: standard deviation of the template's points along each axis [m].
-
-    Returns:
-        Zero for cameras not calibrated on lines; no unknowns without a pitch, else three per point
-        of the template.
+    The response is zero for cameras not calibrated on lines. Without a pitch there are no unknowns,
+    else three per point of the template.
     """
     # This noise predicts the displacement of people by all cameras to 0.6 of 6 mm in simulation.
     noise_px = 0.1
@@ -155,14 +141,10 @@ def survey_response(clip: Clip, survey_error: float) -> Floats:
 def add_shared_errors(covariance: Floats, information: Floats, response: Floats) -> Floats:
     """Return the covariance (cameras, 12, 12) of each camera for correlated calibrations.
 
-    The weights of the adjustment treat calibrations as independent; its errors follow from their
-    correlation (the sandwich of White 1980).
-
-    Args:
-        covariance: (12 cameras, 12 cameras) covariance of the adjustment with independent
-            calibrations.
-        information: (cameras, 12, 12) information of the calibrations in the adjustment.
-        response: (cameras, 12, unknowns) response of each calibration to the shared unknowns.
+    The weights of the adjustment treat calibrations as independent, with covariance (12 cameras, 12
+    cameras); its errors follow from their correlation (the sandwich of White 1980). `information`
+    (cameras, 12, 12) is that of the calibrations in the adjustment, and `response` (cameras, 12,
+    unknowns) that of each calibration to the shared unknowns.
     """
     count, size = information.shape[:2]
     blocks = covariance.reshape(count, size, count, size)

@@ -53,8 +53,7 @@ class Trial:
         matches: matches above chance, summed over the partners [persons per frame].
         chance: matches expected by chance [persons per frame].
         partners: cameras that agree clearly.
-        by_frame: (frames,) matches with all partners, chance included; NaN where the camera has
-            no frame.
+        by_frame: (frames,) matches, chance included; NaN where the camera has no frame.
     """
 
     hypothesis: Hypothesis
@@ -79,8 +78,6 @@ class Comparison:
 
     Attributes:
         cameras: batch (cameras,), as stated.
-        count: number of cameras.
-        frames: number of frames.
         sample: (n,) frames at which cameras are compared.
         search: indices of the sampled frames at which hypotheses are fitted.
         held_out: indices of those at which hypotheses are tested.
@@ -307,10 +304,7 @@ class Comparison:
 
 
 def chance_noise(chance: float) -> float:
-    """Return the standard deviation of the number of chance matches per frame.
-
-    A clip has some ten independent moments: people move slowly.
-    """
+    """Return the deviation of chance matches per frame: a clip has some ten independent moments."""
     return 0.3 * math.sqrt(float(chance) + 0.05)
 
 
@@ -368,15 +362,9 @@ def pair_scores(
     """Return the number of one-to-one matches between two cameras' detections, frame by frame.
 
     A match counts between 0 and 1, by the distance between its rays in standard deviations. The
-    assignment is greedy, best first.
-
-    Args:
-        view: of the first camera.
-        frames: (n,) its compared frames; -1 = none.
-        partner: view of the second camera.
-        partner_frames: (n,) its frame for each of `frames`.
-        heights: lowest and highest mean height of a person's joints [m]; infinite = unknown ground.
-        joint_noise: standard deviation of a detector's joint, on the body [m].
+    assignment is greedy, best first. Compared frames (n,), -1 = none, have each a partner's (n,).
+    `heights` are the lowest and highest mean height of a person's joints [m]; infinite = unknown
+    ground. `joint_noise` is the standard deviation of a detector's joint, on the body [m].
     """
     scores = np.zeros(len(frames))
     for n in range(len(frames)):

@@ -35,21 +35,14 @@ def check_consistency(
 
     The agreement of two cameras is the number of their detections that meet in 3D, one to one,
     above chance. The largest group of cameras in agreement counts as correct. Every other camera,
-    and those of the group in partial agreement, are tested against hypotheses that each correct
-    the camera's calibration, images or clock. The fault is the one whose correction clearly
-    increases matches, in frames that it was not fitted to.
+    and those of the group in partial agreement, are tested against hypotheses that each correct the
+    camera's calibration, images or clock. The fault is the one whose correction clearly increases
+    matches, in frames that it was not fitted to.
 
-    Args:
-        cameras: batch (cameras,).
-        covariance: (cameras, 12, 12) covariance of a step of each; NaN or None for given cameras.
-        detections: (frames, cameras, detections); a confidence of 0 or less excludes a keypoint,
-            only its sign counts.
-        fps: frames per second [1/s].
-        settings: number of compared frames, and noise.
-        ground: whether people stand on z = 0; else they may be anywhere.
-
-    Raises:
-        InputError: the shapes do not fit together.
+    Cameras (cameras,) have covariances (cameras, 12, 12) of a step; NaN or None for given cameras.
+    Of detections (frames, cameras, detections), a confidence of 0 or less excludes a keypoint, only
+    its sign counts. On the ground, people stand on z = 0; else they may be anywhere. InputError for
+    shapes that do not fit together.
     """
     min_focal_error = 0.03  # of the logarithm
     given_tilt = 0.003  # largest plausible rotation error of a given camera [rad]
@@ -168,12 +161,8 @@ def describe_faults(
 ) -> tuple[CameraFault, ...]:
     """Return the faults with the cameras' names and a reason that says what to do.
 
-    Args:
-        found: result of the consistency check.
-        cameras: ids in the order of the cameras.
-        offset_frames: stated offset of each camera's video [frame]; None if it changes.
-        rates: (cameras,) frames of a camera's video per match frame.
-        fps: frames per second of the match [1/s].
+    `offset_frames` is the stated offset of each camera's video [frame], None if it changes; `rates`
+    (cameras,) are frames of it per match frame.
     """
     return tuple(
         CameraFault(

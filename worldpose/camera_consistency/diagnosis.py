@@ -43,7 +43,6 @@ class Fault:
     """A camera that is inconsistent with the others.
 
     Attributes:
-        camera: its index.
         kind: the most probable fault.
         detail: description; may be empty.
         value: ratio or frames, if the fault has one.
@@ -51,8 +50,7 @@ class Fault:
         cause: cause of a contradiction, the fault of this camera that would explain it.
         source: index of the other camera of a swap that would explain a contradiction.
         share_now: share of its detections that agree with others as stated [1].
-        share_corrected: the same share after correction of the fault; None without a known
-            correction.
+        share_corrected: the same after correction of the fault; None without a known correction.
     """
 
     camera: int
@@ -186,8 +184,7 @@ class Diagnosis:
     def blame(self, c: int, trial: Trial, core: Sequence[int]) -> None:
         """Record a fault shown by the cameras of `core`.
 
-        Shown by one camera alone, or by no more than those that agree with it, it is a
-        contradiction.
+        Shown by one camera, or by no more than those that agree with it, it is a contradiction.
         """
         others = [p for p in core if p != c]
         people = self.comparison.people(others) if len(others) > 1 else None
@@ -287,12 +284,8 @@ class Diagnosis:
     def explain(self, c: int, partners: Sequence[int], gross: bool) -> tuple[Trial, Trial] | None:
         """Return the trial of a camera's best confirmed fault, and of the camera as stated.
 
-        Every kind of fault is fitted to a third of the frames and tested on the others.
-
-        Args:
-            c: the camera.
-            partners: cameras assumed correct.
-            gross: whether the camera agrees with none, so that all kinds are tried.
+        Every kind of fault is fitted to a third of the frames and tested on the others. Partners
+        are assumed correct; if the camera agrees with none, `gross`, all kinds are tried.
         """
         if not partners:
             return None

@@ -81,13 +81,10 @@ class CameraHealth:
     ) -> None:
         """Add a chunk of a clip; its first and last frame belong to the neighbours.
 
-        Args:
-            cameras: batch (cameras,).
-            people: detections of tracked people, (frames, cameras, detections).
-            joints: (frames, persons, 17, 3) triangulated [m], world.
-            start: row of the first of these frames in the clip.
-            stated: returns the variance per axis by the calibration (frames, cameras, persons)
-                [px^2] at joints: what it explains is no misfit; None = it explains nothing.
+        Tracked people are (frames, cameras, detections), triangulated joints (frames, persons, 17,
+        3) [m], world; `start` is the row of the first of these frames in the clip. `stated` returns
+        the variance per axis by the calibration (frames, cameras, persons) [px^2] at joints: what
+        it explains is no misfit; None = it explains nothing.
         """
         rows = np.arange(1, len(joints) - 1)
         rows = rows[(start + rows) % self.every == self.every // 2]

@@ -40,7 +40,6 @@ class Hypothesis:
     """A possible camera fault, represented by its correction.
 
     Attributes:
-        kind: kind of the fault.
         detail: description for users.
         camera: the corrected calibration; None = as stated.
         mirrored: whether the detections are mirrored back, with left and right swapped.

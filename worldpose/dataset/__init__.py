@@ -1,1 +1,1 @@
-"""Released data sets: manifest, statistics, and validation."""
+"""Released data sets: manifest, statistics, and validation; InputError names file and place."""

@@ -63,11 +63,7 @@ def is_data_set(folder: Path) -> bool:
 
 
 def parts_of_clips(folder: Path) -> dict[str, Path]:
-    """Return the folder of each clip: the folder itself, or the splits of a release below it.
-
-    Raises:
-        InputError: there are no clips, or one is in two folders.
-    """
+    """Return the folder of each clip, or of a release's splits; InputError for none or doubles."""
     splits = sorted({path.parents[1] for path in folder.glob("*/poses/*.npz")})
     own = any(path for form in (*FORMS, *SUBMISSIONS) for path in folder.glob(form))
     parts: dict[str, Path] = {}
@@ -110,11 +106,8 @@ def score_folders(
     `boxes/<clip>.npz`, or of its joints in its own camera, or in that of the reference.
 
     `body` is the model of pose files that name none, `match_in` the broadcast camera of clips with
-    several, by default the first, `fps` [1/s] by default what the reference states.
-
-    Raises:
-        InputError: a clip is missing, has other frames, or its camera has another convention; the
-            error names file and key.
+    several, by default the first, `fps` [1/s] by default what the reference states. InputError,
+    with file and key, if a clip is missing, has other frames, or its camera has another convention.
     """
     settings = matching.EvaluationSettings()
     clips: dict[str, dict[str, Evaluation]] = {name: {} for name in predictions}
@@ -259,8 +252,7 @@ def _require_metres(mine: _People, true: Floats, distances: Floats) -> None:
 def _true_camera(truth: _People) -> Camera | None:
     """Return the reference's camera (frames,) or (); None without one.
 
-    Raises:
-        InputError: the file is damaged, has other frames than the people, or does not show them.
+    InputError if it has other frames than the people, or does not show them.
     """
     if truth.camera is None:
         return None
@@ -288,9 +280,7 @@ def _convention(path: Path, says: str) -> InputError:
 def _boxes(mine: _People, truth: _People, camera: Camera) -> Floats | None:
     """Return a prediction's boxes (frames, persons, 4) [px]; None = its joints in `camera`.
 
-    Raises:
-        InputError: the boxes have another shape, or only another convention of its camera shows its
-            people where the true ones are.
+    InputError if only another convention of its camera shows people where the true ones are.
     """
     name = mine.clip.name if truth.camera is None else truth.camera.stem
     file, joints = mine.folder / "boxes" / f"{name}.npz", mine.tracks.joints

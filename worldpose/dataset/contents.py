@@ -77,10 +77,7 @@ class CameraView:
         return len(self.rows.rotation) > 1
 
     def shared_points(self, source: PointSource) -> tuple[Floats, Integers] | None:
-        """Return the 2D of the points that a source also has, and their indices in the source.
-
-        None without 2D, or if the numbers of people differ.
-        """
+        """Return the 2D of points that a source has too, and their indices in it; or None."""
         if self.pixels is None or self.pixels.shape[1] != source.points.shape[1]:
             return None
         shared = [name for name in self.skeleton if name in source.skeleton]
@@ -122,13 +119,10 @@ def implausible(fault: str, says: str, *where: str, **figures: float) -> Finding
 
 
 def absent_rows(name: str, arrays: Mapping[str, NDArray[Any]]) -> tuple[Floats, list[Finding]]:
-    """Return a mask of missing persons and frames of a file, and findings on it.
+    """Return a mask (rows, columns) of missing persons and frames of a file, and findings on it.
 
     The arrays (rows, columns, ...) of a file must be missing together. A row is missing if it is so
     in any array, or zero in all.
-
-    Returns:
-        (rows, columns) bool, missing in any array or zero in all; and findings.
     """
     flat = {
         key: array.reshape(*array.shape[:2], math.prod(array.shape[2:]))
@@ -162,11 +156,7 @@ SUBMISSIONS = ("submission.zip", "submission.npz")
 
 
 def list_clips(folder: Path) -> tuple[str, ...]:
-    """Return the names of the clips of a data set.
-
-    Raises:
-        InputError: the folder has neither poses, joints nor a submission.
-    """
+    """Return the names of a data set's clips; InputError without poses, joints and submission."""
     names = {path.stem for path in (folder / "poses").glob("*.npz")}
     names |= {path.name.removesuffix(".joints.npz") for path in folder.glob("*.joints.npz")}
     for name in SUBMISSIONS:
@@ -205,9 +195,6 @@ def read_clip(
 
     `body` returns the body model for a name, or for a file without one; `pitch` says whether the
     ground is z = 0.
-
-    Raises:
-        InputError: a file is damaged.
     """
     sources, findings, ids = _sources(folder, clip, clips, body)
     if manifest is not None and clip in manifest.clips:
@@ -263,9 +250,6 @@ def read_coco(path: Path, ids: tuple[int, ...], shown: Flags) -> Floats | None:
 
     The images are those of the frames with a camera, `shown` (frames,), in order; None if there are
     fewer or more, as of a camera of another rate. People who are not in `ids` are left out.
-
-    Raises:
-        InputError: the file is not a COCO keypoints file.
     """
     pixels = np.full((len(shown), len(ids), len(COCO17), 2), np.nan)
     person_of = {person: place for place, person in enumerate(ids)}

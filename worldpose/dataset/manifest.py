@@ -29,7 +29,7 @@ T = TypeVar("T")
 
 
 def _read(path: Path, form: TypeAdapter[T], expected: str, todo: str) -> T | None:
-    """Read a JSON file of a form; None if there is no such file."""
+    """Read a JSON file of a form; None if there is none, InputError if it is damaged."""
     if not path.is_file():
         return None
     try:
@@ -69,11 +69,7 @@ def write_manifest(folder: Path, manifest: ReleaseManifest | DataSetManifest) ->
 
 
 def read_data_set(folder: Path) -> DataSetManifest:
-    """Read release.json.
-
-    Raises:
-        InputError: there is none, or it is damaged.
-    """
+    """Read release.json; InputError if there is none, or it is damaged."""
     path, todo = folder / DATA_SET, "Give the folder that worldpose release wrote."
     expected = f"the manifest of a data set, contract {CONTRACT_VERSION}"
     found = _read(path, TypeAdapter(DataSetManifest), expected, todo)
@@ -92,22 +88,14 @@ def write_rigs(part: Path, rigs: Mapping[str, Mapping[str, RigCamera]]) -> None:
 
 
 def read_rigs(part: Path) -> dict[str, dict[str, RigCamera]] | None:
-    """Read rigs.json; None in an older release, which has none.
-
-    Raises:
-        InputError: the file is damaged.
-    """
+    """Read rigs.json; None in an older release, which has none."""
     form = TypeAdapter(dict[str, dict[str, RigCamera]])
     expected, todo = "the static cameras of hidden clips", "Copy the truth again from its origin."
     return _read(part / "rigs.json", form, expected, todo)
 
 
 def read_manifest(folder: Path) -> ReleaseManifest | None:
-    """Read the manifest of a release; None if the folder has none.
-
-    Raises:
-        InputError: the file is not a manifest, or has another contract version.
-    """
+    """Read the manifest of a release; None if the folder has none."""
     return _read(
         folder / MANIFEST,
         TypeAdapter(ReleaseManifest),
@@ -137,11 +125,7 @@ LENS_ERRORS: Final = "lens_errors.json"
 
 
 def write_kinds(folder: Path, kinds: Mapping[str, Mapping[int, str]]) -> Path:
-    """Add the kinds of clips' people, by clip and id, to those in the folder; return the file.
-
-    Raises:
-        InputError: the existing file has another format.
-    """
+    """Add the kinds of clips' people, by clip and id, to those in the folder; return the file."""
     path, expected = folder / KINDS, "clips and the kinds of their people by id"
     form = TypeAdapter(dict[str, dict[str, str]])
     known = _read(path, form, expected, "Remove the file, and export again.") or {}
@@ -154,11 +138,7 @@ def write_lens_errors(
 ) -> Path | None:
     """Replace cameras' entries in the folder's lens errors; None leaves a camera out.
 
-    Returns:
-        The file; None if no camera has an entry before or after.
-
-    Raises:
-        InputError: the existing file has another format.
+    Return the file; None if no camera has an entry before or after.
     """
     path, expected = folder / LENS_ERRORS, "cameras and the errors of their lenses"
     form = TypeAdapter(dict[str, dict[str, str | float | None]])
@@ -168,20 +148,12 @@ def write_lens_errors(
 
 
 def write_frame_rates(folder: Path, rates: Mapping[str, float]) -> Path:
-    """Add clips' frames per second [1/s] to the folder's existing ones; return the file.
-
-    Raises:
-        InputError: the existing file has another format.
-    """
+    """Add clips' frames per second [1/s] to the folder's existing ones; return the file."""
     return _write(folder / FRAME_RATES, {**read_frame_rates(folder), **rates})
 
 
 def read_frame_rates(folder: Path) -> dict[str, float]:
-    """Read frames per second [1/s] by clip; empty if the folder has no such file.
-
-    Raises:
-        InputError: the file does not map clips to numbers.
-    """
+    """Read frames per second [1/s] by clip; empty if the folder has no such file."""
     path, expected = folder / FRAME_RATES, "clips and their frames per second"
     return _read(path, _RATES, expected, "Export the data set again.") or {}
 
@@ -194,11 +166,7 @@ def clip_frame_rate(rates: Mapping[str, float], clip: str) -> float | None:
 
 
 def stated_rate(folder: Path, clip: str) -> float | None:
-    """Return the frame rate of a clip [1/s] that the folder states, or else match.yaml around it.
-
-    Raises:
-        InputError: one of these files is invalid.
-    """
+    """Return the frame rate of a clip [1/s] that the folder states, or the match.yaml around it."""
     if (manifest := read_manifest(folder)) is not None:
         return manifest.fps
     rate = clip_frame_rate(read_frame_rates(folder), clip)

@@ -22,10 +22,8 @@ CameraKind = Literal["S", "M", "M+Z"]
 def read_places(folder: Path, clip: str) -> Floats:
     """Return people's positions in a clip (frames, persons, 3) [m]; NaN where one is missing.
 
-    The pelvis of poses, up to an offset per person, or the mid-hip.
-
-    Raises:
-        InputError: a file is damaged, or the clip has no positions.
+    They are the pelvis of poses, up to an offset per person, or the mid-hip. InputError without
+    any.
     """
     poses = folder / "poses" / f"{clip}.npz"
     if poses.is_file():
@@ -100,11 +98,7 @@ def most_moving(kinds: Iterable[CameraKind | None]) -> CameraKind | None:
 
 
 def camera_kind(path: Path) -> CameraKind | None:
-    """Return the kind of a file's camera; None if it is unknown.
-
-    Raises:
-        InputError: the file is damaged.
-    """
+    """Return the kind of a file's camera; None if it is unknown."""
     rows = read_camera_rows(path)
     if len(rows.rotation) == 1 and np.isfinite(rows.rotation).all():  # one row holds throughout
         return "S"

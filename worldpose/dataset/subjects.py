@@ -75,11 +75,7 @@ def write_subjects(path: Path, fits: Iterable[SubjectFit]) -> None:
 
 
 def read_subjects(path: Path) -> list[SubjectFit]:
-    """Read the rows of subjects.npz: first pooled ones, without a clip, then those of clips.
-
-    Raises:
-        InputError: the file is absent or damaged.
-    """
+    """Read the rows of subjects.npz: first pooled ones, without a clip, then those of clips."""
     members = dict.fromkeys(("subjects", "body_models", "clips"), Member(("rows",), "text"))
     members["betas"] = Member(("rows", "shapes"), "float")
     members["covariance"] = Member(("rows", "shapes", "shapes"), "float")

@@ -27,19 +27,14 @@ _STEP = np.eye(8) + np.eye(8, k=4)
 class BoxTracker:
     """Tracks of one camera.
 
-    A Kalman filter per track estimates the centre, width and height of its box and their change
-    per frame. High-score boxes are assigned to tracks first. Low-score boxes only continue
-    unmatched tracks that were seen in the previous frame, and they begin none: a partly occluded
-    person keeps the track, and a flickering box in the crowd does not become one.
+    A Kalman filter per track estimates the centre, width and height of its box and their change per
+    frame. High-score boxes are assigned to tracks first. Low-score boxes only continue unmatched
+    tracks that were seen in the previous frame, and they begin none: a partly occluded person keeps
+    the track, and a flickering box in the crowd does not become one.
     """
 
     def __init__(self, high_score_threshold: float, track_buffer_frames: int) -> None:
-        """Begin without tracks.
-
-        Args:
-            high_score_threshold: score from which on a box may begin a track [1].
-            track_buffer_frames: frames after which an unseen track ends.
-        """
+        """Begin without tracks, which boxes of a high score may begin, and unseen frames end."""
         self._high_score = high_score_threshold
         self._buffer = track_buffer_frames
         self._mean: Floats = np.empty((0, 8))
@@ -51,10 +46,8 @@ class BoxTracker:
     def update(self, boxes: Floats, scores: Floats, frames: int = 1) -> Integers:
         """Return the track of each box (boxes,), -1 for low-score boxes that continue none.
 
-        Args:
-            boxes: (boxes, 4) x0, y0, x1, y1 [px] of the next frame in which people were detected.
-            scores: (boxes,).
-            frames: number of frames since the previous call's frame.
+        Boxes (boxes, 4) x0, y0, x1, y1 [px] with scores (boxes,) are those of the next frame in
+        which people were detected, `frames` after the previous call's.
         """
         for _ in range(frames):
             self._predict()
@@ -164,11 +157,7 @@ class BoxCleaner:
     def clean(
         self, frames: Iterable[tuple[int, Image | None, People | None]]
     ) -> Iterator[tuple[int, Image | None, People]]:
-        """Yield each frame with the people in it.
-
-        Args:
-            frames: rising numbers, images, and detections; None where no detector ran.
-        """
+        """Yield each frame with the people in it, of frames with None where no detector ran."""
         gap, later = self._settings.longest_gap, self._settings.min_hits - 1
         for number, image, people in frames:
             self._held.append(_BufferedFrame(number, image))
@@ -241,12 +230,7 @@ def detect_strided(
     """Yield each frame with its detections; detectors run on every `stride`-th and the last one.
 
     In place of one without an image, they run on the next one, and on the one before where the
-    tracks could not be filled from run to run.
-
-    Args:
-        frames: rising numbers with images; None where there is none.
-        detect: detects people in images of one size.
-        settings: stride, batch and longest gap.
+    tracks could not be filled from run to run. Numbers rise; `detect` takes images of one size.
     """
     waiting: list[tuple[int, Image | None]] = []
     chosen: list[int] = []

@@ -116,10 +116,7 @@ def _search(frame: Frame, parts: Sequence[Part] | None) -> Steps:
 
 
 def _close_up(frame: Frame, usual: float) -> Generator[Sequence[View], list[People], float]:
-    """Return the reduction of a frame that people fill; 1 for other frames [1].
-
-    People who fill a frame are as high at these reductions as in the training.
-    """
+    """Return the reduction [1] that shows people who fill a frame as in training; 1 for others."""
     if usual >= 0.6:  # the best score of people of usual size
         return 1.0
     best, chosen = usual + 0.05, 1.0

@@ -73,10 +73,8 @@ class Residual(nn.Module):
 class Pyramid(nn.Module):
     """Features of the finest map, with the context of all coarser ones.
 
-    Args:
-        stem: layers from the image to the finest map.
-        widths: channels of the maps, each half the size of the one before it.
-        depths: residual blocks on each map.
+    `stem` are layers from the image to the finest map. Of each map, half the size of the one before
+    it, `widths` are the channels, and `depths` the residual blocks.
     """
 
     def __init__(self, stem: nn.Module, widths: Sequence[int], depths: Sequence[int]) -> None:
@@ -117,14 +115,11 @@ class PeopleNet(nn.Module):
         self.head = nn.Sequential(Block(24, 32), last)
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the maps of frames whose sides are multiples of `COARSEST`.
+        """Return the maps of images (batch, 3, height, width) from `normalize`.
 
-        Args:
-            images: (batch, 3, height, width) images from `normalize`.
-
-        Returns:
-            Logits that a cell is a person's centre (batch, rows, columns), and distances from the
-            cell's centre to left, top, right and bottom (batch, 4, rows, columns) [px].
+        Sides are multiples of `COARSEST`. Maps are logits that a cell is a person's centre (batch,
+        rows, columns), and distances from there to left, top, right and bottom (batch, 4, rows,
+        columns) [px].
         """
         features, _ = self.pyramid(images)
         maps = self.head(features).float()
@@ -152,8 +147,7 @@ class Seen(NamedTuple):
     def sureness(self, mass: Tensor) -> Tensor:
         """Return logits that joints are correct, from the crop and the mass of their peaks.
 
-        Args:
-            mass: (batch, 17) or, for several positions each, (batch, 17, places).
+        The mass is (batch, 17) or, for several positions each, (batch, 17, places).
         """
         places = (1,) * (mass.ndim - 2)
         trusted = self.trust.view((-1, *places)) * torch.logit(mass, eps=1e-4)
@@ -176,11 +170,9 @@ class KeypointNet(nn.Module):
         self.fit = nn.Sequential(nn.Linear(128 + 4, 32), nn.ReLU(), nn.Linear(32, 1))
 
     def forward(self, crops: Tensor, surroundings: Tensor) -> Seen:
-        """Return the net's output for crops.
+        """Return the net's output for crops (batch, 3, height, width) from `normalize`.
 
-        Args:
-            crops: (batch, 3, height, width) crops from `normalize`.
-            surroundings: (batch, 3, rows, columns) maps of the target box and its neighbours.
+        `surroundings` (batch, 3, rows, columns) are maps of the target box and its neighbours.
         """
         features, coarsest = self.pyramid(crops, self.around(surroundings))
         maps = functional.pixel_shuffle(self.head(features), CELL)
@@ -197,15 +189,10 @@ def normalize(images: Tensor) -> Tensor:
 
 
 def peaks(maps: Tensor) -> tuple[Tensor, Tensor]:
-    """Return subcell positions of joints and the probability around each position.
+    """Return positions (batch, joints, 2) [px of the crop] and mass (batch, joints) of joints.
 
-    The position is the mean over the 5 x 5 cells around the most likely one.
-
-    Args:
-        maps: (batch, joints, rows, columns) logits.
-
-    Returns:
-        Keypoints (batch, joints, 2) [px of the crop], and mass (batch, joints).
+    The position is finer than a cell: the mean over the 5 x 5 cells around the likeliest one of
+    logits (batch, joints, rows, columns). The mass is the probability there.
     """
     columns = maps.shape[-1]
     chance = functional.softmax(maps.flatten(2), dim=-1).view(-1, *maps.shape[2:])
@@ -218,13 +205,8 @@ def peaks(maps: Tensor) -> tuple[Tensor, Tensor]:
 def edges(maps: Tensor) -> tuple[Tensor, Tensor]:
     """Return the edges of a box and the standard deviations of their probabilities.
 
-    Each map is reduced to one axis: an edge's probability over columns or rows.
-
-    Args:
-        maps: (batch, 4, rows, columns) logits of left, top, right and bottom.
-
-    Returns:
-        Edges and their standard deviations, both (batch, 4) [px of the crop, cells].
+    Each map, of logits (batch, 4, rows, columns) of left, top, right and bottom, is reduced to one
+    axis: an edge's probability over columns or rows. Both are (batch, 4) [px of the crop, cells].
     """
     places, spreads = [], []
     edge_cell = 4  # Pixels of the crop per cell of the edge maps [px].
@@ -241,11 +223,9 @@ def edges(maps: Tensor) -> tuple[Tensor, Tensor]:
 def decode_boxes(maps: Sequence[tuple[Tensor, ...]], least: float) -> Tensor:
     """Return people as rows of the index of the image, box [px] and score (people, 6).
 
-    Args:
-        maps: of images of some sizes, logits (batch, rows, columns) that a cell is a person's
-            centre, and distances (batch, 4, rows, columns) from there to left, top, right and
-            bottom [px].
-        least: lowest score reported.
+    Images of some sizes have logits (batch, rows, columns) that a cell is a person's centre.
+    Distances (batch, 4, rows, columns) are from there to left, top, right and bottom [px]. `least`
+    is the lowest score reported.
     """
     limit, first, found = math.log(least / (1.0 - least)), 0, list[Tensor]()
     for logits, sides in maps:
@@ -289,9 +269,7 @@ def _find_boxes(logits: Singles, sides: Singles, cells: NDArray[np.intp]) -> Flo
 def _means(chance: Tensor, cells: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     """Return mean positions (cells, 2) [px of the crop] and mass of the 5 x 5 cells around cells.
 
-    Args:
-        chance: (maps, rows, columns) probabilities.
-        cells: index of the map, row and column of each cell.
+    Cells are the index of a map of probabilities (maps, rows, columns), row and column.
     """
     step = torch.arange(-2, 3, device=chance.device)
     index, row, column = (each[:, None, None] for each in cells)
@@ -308,15 +286,10 @@ def decode_candidates(maps: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Return candidate positions of each joint, finer than cells, the likeliest first.
 
     Positions are the means over the 5 x 5 cells around the peaks of a map, the highest cells within
-    three cells of them.
-
-    Args:
-        maps: (batch, joints, rows, columns) logits; rows and columns are multiples of four.
-        count: positions of each joint.
-
-    Returns:
-        Positions (batch, joints, count, 2) [px of the crop], and the probability around each
-        (batch, joints, count); 0 where a map has fewer peaks with a probability of 0.01.
+    three cells of them. Logits are (batch, joints, rows, columns), rows and columns multiples of
+    four. Returned are positions (batch, joints, count, 2) [px of the crop] and the probability
+    around each (batch, joints, count). It is 0 where a map has fewer peaks with a probability of
+    0.01.
     """
     shape, flat = maps.shape[:2], maps.flatten(0, 1)
     # Candidate positions of less probability are dropped, except the likeliest of a joint [1].
@@ -391,13 +364,7 @@ def _find_candidates(chance: Singles, count: int, least: np.float32) -> tuple[Si
 
 
 def save_weights(path: Path, net: nn.Module, about: dict[str, str] | None = None) -> None:
-    """Write a net's weights atomically; equal weights give equal bytes.
-
-    Args:
-        path: an existing file is replaced.
-        net: one of `worldpose.detection.bundled_nets`.
-        about: further metadata, such as the origin of the weights.
-    """
+    """Write a net's weights, with metadata `about`, atomically; equal weights give equal bytes."""
     tensors = {name: value.detach().contiguous() for name, value in net.state_dict().items()}
     data = save(tensors, {**(about or {}), FORMAT: type(net).__name__})
     # The library orders metadata at random.
@@ -415,8 +382,7 @@ def save_weights(path: Path, net: nn.Module, about: dict[str, str] | None = None
 def load_weights(path: Path, net: Net) -> Net:
     """Return `net` with the weights of a file, in evaluation mode.
 
-    Raises:
-        InputError: no safetensors file, weights of another net, or numbers that are not finite.
+    InputError for no safetensors file, weights of another net, or numbers that are not finite.
     """
 
     def refusal(found: str) -> InputError:

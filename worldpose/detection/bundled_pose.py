@@ -183,15 +183,9 @@ def assign_joints(places: Floats, mass: Floats, boxes: Floats) -> NDArray[np.int
 
     A map often shows the joints of a neighbour too. People choose their likeliest candidates in
     turn, the most certain person first. A candidate costs more, the more certainly a neighbour has
-    the same joint, of either side, there.
-
-    Args:
-        places: (people, 17, count, 2) [px], the likeliest first.
-        mass: (people, 17, count) probabilities.
-        boxes: (people, 4) [px].
-
-    Note:
-        Li et al., CrowdPose, 2019: assigns candidate joints to people in crowds.
+    the same joint, of either side, there (Li et al., CrowdPose, 2019). Places (people, 17, count,
+    2) [px] are the likeliest first, with probabilities `mass` (people, 17, count); boxes are
+    (people, 4).
     """
     people, joints, _ = mass.shape
     taken = np.zeros((people, joints), dtype=np.intp)
@@ -235,13 +229,8 @@ def find_occluded_people(people: People) -> Steps:
     """Find occluded people next to detected ones that the detector missed, with their poses.
 
     The net takes a target box and the boxes of its neighbours. It first runs on boxes a step to
-    either side of every detected person, then a second time on the boxes that it returned.
-
-    Args:
-        people: detected people, with the estimator's boxes.
-
-    Note:
-        Iterative detection conditioned on earlier detections: Rukhovich et al., IterDet, 2020.
+    either side of every detected person, with the estimator's box. A second time it runs on the
+    boxes that it returned (Rukhovich et al., IterDet, 2020).
     """
     # Score of a detection from which on its neighbourhood is searched [1].
     sure = people.scores >= 0.25

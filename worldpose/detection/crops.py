@@ -25,9 +25,7 @@ OUTSIDE: Final = 115
 def crops_around(boxes: Floats, size: tuple[int, int] = CROP) -> Floats:
     """Return the crops (people, 3) that show boxes whole: centre x, y [px], frame px per crop px.
 
-    Args:
-        boxes: (people, 4) x0, y0, x1, y1 [px].
-        size: width, height of the crops [px].
+    Boxes are (people, 4) x0, y0, x1, y1 [px], the size of crops is width, height [px].
     """
     sides = boxes[:, 2:] - boxes[:, :2]
     # Size of a crop over that of its box [1]: keypoints may lie outside of a box.
@@ -41,11 +39,8 @@ def frame_from_crop(
 ) -> Floats:
     """Return the affine maps (..., 2, 3) from pixels of crops to pixels of the frame.
 
-    Args:
-        crop: (..., 3) crops from `crops_around`.
-        size: width, height of the crop [px].
-        turn: rotation of the crop within the frame, from x to y [rad].
-        mirrored: whether the crop is mirrored left to right.
+    Crops (..., 3) of `crops_around` have a size, width, height [px], and a turn within the frame,
+    from x to y [rad]; `mirrored` ones are so left to right.
     """
     cos, sin = np.cos(turn), np.sin(turn)
     linear = crop[..., 2, None, None] * np.array([[cos, -sin], [sin, cos]])
@@ -56,13 +51,10 @@ def frame_from_crop(
 
 
 def cut_crop(image: Image, mapping: Floats, size: tuple[int, int], outside: int = OUTSIDE) -> Image:
-    """Return a crop (height, width, 3), grey outside of the frame.
+    """Return a crop (height, width, 3) of an image, grey `outside` of the frame [of 255].
 
-    Args:
-        image: (height, width, 3).
-        mapping: (2, 3) affine map from pixels of the crop to those of the frame.
-        size: width, height of the crop [px].
-        outside: grey level outside of the frame [of 255].
+    The mapping (2, 3) is affine, from pixels of the crop of a width, height [px] to those of the
+    frame.
     """
     shrink = float(_scale(mapping))
     if shrink > 2.0:
@@ -112,13 +104,9 @@ def surroundings(
 ) -> Singles:
     """Return the share of each cell of crops that boxes cover (crops, 3, rows, columns) [1].
 
-    The person whose box ends lower in the frame stands nearer to the camera.
-
-    Args:
-        boxes: (crops, 4) box of the target person x0, y0, x1, y1 [px].
-        others: boxes (people, 4) of others, for each crop [px].
-        mappings: (crops, 2, 3) affine maps from pixels of the crops to those of the frame.
-        size: width, height of the crops [px].
+    The person whose box ends lower in the frame stands nearer to the camera. Boxes (crops, 4) of
+    targets are x0, y0, x1, y1 [px], `others` (people, 4) of others, for each crop. The mappings
+    (crops, 2, 3) are affine, from pixels of crops of a width, height [px] to those of the frame.
     """
     columns, rows = size[0] // MAP_CELL, size[1] // MAP_CELL
     crop = np.repeat(np.arange(len(boxes)), [1 + len(each) for each in others])

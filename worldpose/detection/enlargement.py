@@ -95,13 +95,7 @@ class SeesParts(Detector, Protocol):
 
 
 def restore_size(people: People, size: tuple[int, int], zoom: float) -> People:
-    """Return people of a resized image in the pixels of the original.
-
-    Args:
-        people: people in the resized image.
-        size: width, height of the original [px].
-        zoom: factor of `sampling.resize`.
-    """
+    """Return people of an image resized by `zoom` in pixels of the original width, height [px]."""
     scale = [side / max(1, round(zoom * side)) for side in (*size, *size)]
     return People((people.boxes + 0.5) * scale - 0.5, people.scores)
 
@@ -124,12 +118,8 @@ def _sure_heights(people: People) -> Floats:
 def find_small(people: People, shape: tuple[int, ...], step: tuple[float, float]) -> list[Part]:
     """Return the tiles around a frame's people, if half of them are smaller than a limit.
 
-    The surest people decide; where none is sure, all do.
-
-    Args:
-        people: detections in the whole frame.
-        shape: height, width of the frame [px].
-        step: step of `STEPS`.
+    The surest people in the frame of a height, width [px] decide; where none is sure, all do. The
+    step is one of `STEPS`.
     """
     sure = _sure_heights(people)
     if not len(sure) or np.median(sure) >= step[0]:
@@ -143,12 +133,7 @@ def expect_parts(camera: Camera, pitch: PitchTemplate, margin: float) -> list[Pa
     """Return the parts in which a calibrated camera shows people on the pitch too small or large.
 
     Where they are too large, the part is the whole frame: a pass over it costs a quarter of the
-    first.
-
-    Args:
-        camera: the camera.
-        pitch: its lines and its surface.
-        margin: around the pitch [m].
+    first. The margin is around the pitch [m].
     """
     half = np.array([pitch.length, pitch.width]) / 2
     # People are expected at positions 2 m apart, 1.8 m tall.
@@ -206,11 +191,9 @@ def _tile(boxes: Floats, shape: tuple[int, ...], step: tuple[float, float]) -> l
 
 
 def find_groups(people: People, shape: tuple[int, ...]) -> list[Part]:
-    """Return the groups that need a second detection pass, one entry per enlargement.
+    """Return the groups in a frame of a height, width [px] that need a second detection pass.
 
-    Args:
-        people: detections in the whole frame.
-        shape: height, width of the frame [px].
+    There is one entry per enlargement.
     """
     sure = suppress(people, SAME_PERSON_IOU)
     boxes = sure.boxes[sure.scores >= MIN_GROUP_SCORE]

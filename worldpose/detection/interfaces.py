@@ -51,11 +51,7 @@ class ScoreMap:
     """Map of a net's scores to the probability that a box is a person's.
 
     The logit of the probability is a linear function of the logit of the score (Platt scaling of
-    log odds), so that the order of boxes stays.
-
-    Attributes:
-        slope: factor on the logit, more than 0 [1].
-        offset: added to it [1].
+    log odds). The slope is above 0, so that the order of boxes stays.
     """
 
     slope: float
@@ -88,16 +84,12 @@ class PoseEstimator(Protocol):
     """An estimator of the keypoints of people whose boxes are known."""
 
     def estimate(self, image: Image, boxes: Floats) -> KeypointDetections:
-        """Return the pose in each box, in frame pixels; keypoints may lie outside of their box.
+        """Return the pose in each box (people, 4) x0, y0, x1, y1 [px] of the whole frame.
 
-        Args:
-            image: the whole frame.
-            boxes: (people, 4) x0, y0, x1, y1 [px].
-
-        Returns:
-            The poses in the order of `boxes`. Their boxes are as the estimator sees them in a crop,
-            finer than a detector's, and their scores are the expected intersections over union of
-            these and the true boxes; both are NaN from an estimator of joints alone.
+        Keypoints are in frame pixels, and may lie outside of their box. Boxes of poses are as the
+        estimator sees them in a crop, finer than a detector's, and their scores are the expected
+        intersections over union of these and the true boxes; both are NaN from an estimator of
+        joints alone.
         """
 
 
@@ -126,9 +118,7 @@ class PointEstimator(Protocol):
     def add_points(
         self, images: Sequence[Image], people: Sequence[KeypointDetections]
     ) -> list[KeypointDetections]:
-        """Return the people of frames of one size with these points and no others.
+        """Return the people (people,) of whole frames of one size with these points and no others.
 
-        Args:
-            images: the whole frames.
-            people: (people,) with boxes, for each frame; none is a valid request.
+        They have boxes; none is a valid request.
         """

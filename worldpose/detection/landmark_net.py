@@ -42,8 +42,7 @@ class SeenLandmarks(NamedTuple):
         maps: logits of each point's position (batch, points, rows, columns).
         doubt: logarithm of the standard deviation from the crop as a whole (batch, points).
         visible: logits that points are visible (batch, points).
-        trust: weight of the logarithm of a map's extent in that of the standard deviation
-            (points,).
+        trust: weight (points,) of the logarithm of a map's extent in that of the deviation.
     """
 
     maps: Tensor
@@ -63,12 +62,9 @@ class SeenLandmarks(NamedTuple):
 def locate(maps: Tensor) -> tuple[Tensor, Tensor]:
     """Return positions and the logarithms of the extents of maps around them.
 
-    Args:
-        maps: (batch, points, rows, columns) logits.
-
-    Returns:
-        Positions (batch, points, 2) [px of the crop], and the logarithm of the root mean square
-        distance per axis of a map's probability from there (batch, points) [log px].
+    Of logits (batch, points, rows, columns), positions are (batch, points, 2) [px of the crop]. The
+    logarithm of the root mean square distance per axis of a map's probability from there is (batch,
+    points) [log px].
     """
     places, square = _measure(maps)
     return places, 0.5 * torch.log(square + MIN_SQUARE)
@@ -126,15 +122,11 @@ class LandmarkEstimator:
     def add_points(
         self, images: Sequence[Image], people: Sequence[KeypointDetections]
     ) -> list[KeypointDetections]:
-        """Return the people of frames of one size with `POINTS`.
+        """Return the people (people,) of whole frames of one size, with boxes, with `POINTS`.
 
-        Confidence is the probability that a point is correct, from its standard deviation: within
-        a twentieth of the box's longer side, as for joints. Points that are probably not visible
-        are missing.
-
-        Args:
-            images: the whole frames.
-            people: (people,) with boxes, for each frame.
+        Confidence is the probability that a point is correct, from its standard deviation: within a
+        twentieth of the box's longer side, as for joints. Points that are probably not visible are
+        missing.
         """
         boxes = [np.asarray(each.boxes, dtype=np.float64) for each in people]
         more = []
@@ -155,12 +147,7 @@ class LandmarkEstimator:
         return more
 
     def estimate(self, images: Sequence[Image], boxes: Sequence[Floats]) -> list[Landmarks]:
-        """Return the points of the person in each box.
-
-        Args:
-            images: the whole frames, of one size.
-            boxes: (people, 4) x0, y0, x1, y1 [px], for each frame.
-        """
+        """Return points of boxes (people, 4) x0, y0, x1, y1 [px] in whole frames of one size."""
         others = [each[row <= SAME_PERSON_IOU] for each in boxes for row in box_iou(each, each)]
         shape = (len(others), len(POINTS))
         places, std, visible = np.empty((*shape, 2)), np.empty(shape), np.empty(shape)

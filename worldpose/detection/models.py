@@ -57,8 +57,7 @@ PULLED_FILES: Final = "files"
 def model_folder() -> Path:
     """Return the folder of pulled checkpoints: WORLDPOSE_MODEL_FOLDER, or in the user's cache.
 
-    Raises:
-        UsageError: neither is there.
+    UsageError if neither is there.
     """
     given = os.environ.get("WORLDPOSE_MODEL_FOLDER")
     if given:
@@ -75,11 +74,7 @@ def model_folder() -> Path:
 
 
 def read_pulled(name: str, folder: Path) -> Checkpoint | None:
-    """Return the record of a pulled checkpoint; None if it is not in the folder.
-
-    Raises:
-        InputError: its record is damaged.
-    """
+    """Return the record of a pulled checkpoint; None if it is not in the folder."""
     file = folder / name / PULLED_RECORD
     if not file.is_file():
         return None
@@ -112,9 +107,8 @@ def _share(load: Callable[[], Loaded], name: str, path: Path | None, *how: Hasha
 def load_detectors(settings: DetectionSettings) -> list[Detector]:
     """Return the detectors that the settings name.
 
-    Raises:
-        InputError: an unknown kind, missing or unexpected weights, or a library that is not
-            installed.
+    InputError for an unknown kind, missing or unexpected weights, or a library that is not
+    installed.
     """
     how = settings.device, settings.half, settings.person_classes
     return [
@@ -170,17 +164,11 @@ def _detector(kind: str, path: Path | None, settings: DetectionSettings) -> Dete
 def load_bundled_detector(
     weights: Path | None = None, device: str = "cpu", half: bool = False
 ) -> Detector:
-    """Return the bundled detector.
+    """Return the bundled detector, of the shipped weights or a file of a fine-tuned version.
 
-    On a CPU the shipped version computes in integers, a fine-tuned one in floating point.
-
-    Args:
-        weights: a file of a fine-tuned version; the shipped one if None.
-        device: `cpu` or `cuda`.
-        half: compute in half precision, on a GPU only.
-
-    Raises:
-        InputError: the file holds other weights than this detector's, or torch is not installed.
+    On a CPU the shipped version computes in integers, a fine-tuned one in floating point. The
+    device is `cpu` or `cuda`, where it may compute in half precision. InputError for another net's
+    weights, or if torch is not installed.
     """
     net = _bundled_net("PeopleNet", BUNDLED_WEIGHTS[0], weights, device)
     from worldpose.detection.bundled_detector import BundledDetector
@@ -201,10 +189,7 @@ def load_bundled_pose(
 def load_landmarks(settings: DetectionSettings) -> LandmarkEstimator | None:
     """Return the estimator of landmarks; None if the settings ask for none.
 
-    On a CPU it computes in integers.
-
-    Raises:
-        InputError: torch is not installed.
+    On a CPU it computes in integers. InputError if torch is not installed.
     """
     if not settings.landmarks:
         return None
@@ -235,10 +220,7 @@ def _bundled_net(kind: str, shipped: Path, weights: Path | None, device: str) ->
 def weights_of(settings: DetectionSettings) -> dict[str, str | None]:
     """Return SHA-256 of the named weights, and versions of the libraries that compute them.
 
-    The embedded weights are part of the code and have no digest.
-
-    Raises:
-        InputError: an unknown kind, or missing weights.
+    The embedded weights are part of the code and have no digest. InputError as of `load_detectors`.
     """
     names: list[tuple[str, Task]] = [(name, "detector") for name in settings.detector]
     names += [(settings.pose, "pose")]
@@ -261,12 +243,9 @@ def _installed_version(library: str) -> str | None:
 
 
 def digest_of_weights(path: Path) -> str:
-    """Return SHA-256 of a file, or of several files with their names.
+    """Return SHA-256 of a file, or of several files with their names; InputError if it is missing.
 
     Several are those of a folder, or an ONNX file and its external data.
-
-    Raises:
-        InputError: the path does not exist.
     """
     if not path.exists():
         raise InputError(
@@ -320,11 +299,7 @@ def _split_name(name: str, task: Task) -> tuple[str, Path | None]:
 
 
 def _find_pulled(name: str, task: Task) -> tuple[str, Path]:
-    """Return kind and path of a pulled checkpoint.
-
-    Raises:
-        InputError: the checkpoint was not pulled, or has another task.
-    """
+    """Return kind and path of a pulled checkpoint; InputError if it is none, or of another task."""
     folder = model_folder()
     # A name is never a path.
     known = name == Path(name).name and not name.startswith(".")

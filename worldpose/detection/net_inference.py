@@ -38,13 +38,10 @@ WEIGHTS_DIGEST: Final = "weights_sha256"
 
 
 class PlacedNet:
-    """A net where it is computed, in batches that fit into memory.
+    """A net on a device, `cpu` or `cuda`, in batches that fit into memory.
 
-    It has no state besides its batch, so threads may share it.
-
-    Attributes:
-        device: `cpu` or `cuda`.
-        batch: most images that are computed at once; halved where a GPU's memory is too small.
+    It has no state besides its batch, which is halved where a GPU's memory is too small, so threads
+    may share it.
     """
 
     def __init__(
@@ -56,18 +53,11 @@ class PlacedNet:
         *,
         fill: int = 1,
     ) -> None:
-        """Place a net.
+        """Place a net, in integers on the CPU, or in floating point, which is changed in place.
 
-        Args:
-            net: a net in integers, which computes on the CPU, or one in floating point, which is
-                changed in place.
-            device: `cpu` or `cuda`.
-            half: convolutions compute in half precision, on a GPU only.
-            decode: returns what the caller needs of the outputs of a batch; None = all.
-            fill: batches in floating point are filled to multiples of it.
-
-        Raises:
-            InputError: torch finds no GPU.
+        On a GPU, and only there, convolutions may compute in `half` precision. `decode` returns
+        what the caller needs of the outputs of a batch; None = all. Batches in floating point are
+        filled to multiples of `fill`. InputError if torch finds no GPU.
         """
         self.device = "cpu" if isinstance(net, QuantizedNet) else device
         # Crops, or frames of full size, that keep a GPU busy.
@@ -81,11 +71,7 @@ class PlacedNet:
                     module.to(self._kind)
 
     def __call__(self, *given: Given) -> Tensors:
-        """Return the outputs, on the device, for one image or more.
-
-        Args:
-            given: images (batch, height, width, 3) of bytes, and what else the net takes.
-        """
+        """Return the outputs, on the device, for images (batch, height, width, 3) of bytes."""
         found, start = list[Tensors](), 0
         while start < len(given[0]):
             part = [each[start : start + self.batch] for each in given]
@@ -132,10 +118,8 @@ def run_together(
 ) -> list[Result]:
     """Return the results of several frames, whose nets see what all ask for at once.
 
-    Args:
-        steps: one generator per frame; it yields what the nets shall see, gets what they saw, and
-            returns its result.
-        compute: returns what the nets see, from the numbers of the frames and what they ask for.
+    One generator per frame yields what the nets shall see, gets what they saw, and returns its
+    result. `compute` returns that from the numbers of the frames and what they ask for.
     """
     results: dict[int, Result] = {}
     answers: dict[int, Seen | None] = dict.fromkeys(range(len(steps)))
@@ -151,20 +135,13 @@ def run_together(
 
 
 class QuantizedNet:
-    """A net in 8-bit integers, for images of bytes.
+    """A net in 8-bit integers, for images of bytes, from float weights of a file of that SHA-256.
 
     Integers give equal bytes for an image, whatever the other images of the batch are.
-
-    Attributes:
-        weights_sha256: SHA-256 of the file of float weights that it was made from.
     """
 
     def __init__(self, file: Path) -> None:
-        """Open a file that infra/embedded_detector/quantize.py has written.
-
-        Raises:
-            InputError: onnxruntime is not installed.
-        """
+        """Open a file of infra/embedded_detector/quantize.py; InputError without onnxruntime."""
         self._session = open_session(file, "cpu")
         self._names = [each.name for each in self._session.get_inputs()]
         self.weights_sha256 = self._session.get_modelmeta().custom_metadata_map[WEIGHTS_DIGEST]
@@ -177,11 +154,7 @@ class QuantizedNet:
 
 
 def require_gpu(device: str) -> None:
-    """Refuse `cuda` where torch finds no GPU.
-
-    Raises:
-        InputError: torch finds none.
-    """
+    """Raise InputError for `cuda` where torch finds no GPU."""
     if device == "cuda" and not torch.cuda.is_available():
         raise InputError(
             "detection.device",
@@ -192,11 +165,7 @@ def require_gpu(device: str) -> None:
 
 
 def place_net(net: Net, device: str) -> Net:
-    """Return the net on a device, its batch normalisations folded into convolutions.
-
-    Raises:
-        InputError: torch finds no GPU.
-    """
+    """Return the net on a device, its batch normalisations folded; InputError without a GPU."""
     require_gpu(device)
     placed = fold_normalisations(net.eval()).to(device)
     placed.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -204,11 +173,7 @@ def place_net(net: Net, device: str) -> Net:
 
 
 def fold_normalisations(net: Net) -> Net:
-    """Return `net` for inference: its normalisations are part of its convolutions.
-
-    Args:
-        net: net with its weights, changed in place.
-    """
+    """Change `net` for inference: its normalisations become part of its convolutions."""
     for module in net.modules():
         if isinstance(module, Block):
             convolution, normalisation = module[0], module[1]

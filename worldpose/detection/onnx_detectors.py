@@ -64,17 +64,11 @@ def load_onnx_detector(
     form: str | None = None,
     person_classes: Sequence[int] | None = None,
 ) -> Detector:
-    """Return a detector of people from an ONNX file.
+    """Return a detector of people from an ONNX file, on `cpu` or `cuda`.
 
-    Args:
-        file: the net.
-        device: `cpu` or `cuda`.
-        form: a name in `FORMS`; None: recognized from the outputs for a grey image.
-        person_classes: classes of people; None: the net's own class names, or COCO's person.
-
-    Raises:
-        InputError: onnxruntime is not installed, the file is no such net, its form is in doubt, or
-            its classes of people are unknown.
+    The form is a name in `FORMS`; None: recognized from the outputs for a grey image. Classes of
+    people are by default the net's own names, or COCO's person. InputError if onnxruntime is not
+    installed, the file is no such net, its form is in doubt, or its classes of people are unknown.
     """
     if form is not None and form not in FORMS:
         raise InputError(
@@ -93,15 +87,10 @@ def load_onnx_detector(
 
 
 def recognize_form(where: str, outputs: Outputs, size: tuple[int, int]) -> str:
-    """Return the name of the form that a net's outputs have.
+    """Return the one form of a net's outputs for one image, without the batch dimension.
 
-    Args:
-        where: the file, for messages.
-        outputs: outputs for one image, without the batch dimension.
-        size: width, height of the net's input [px].
-
-    Raises:
-        InputError: no form, or more than one, has such outputs.
+    `size` is width, height of the net's input [px]. InputError, with the file `where`, for none, or
+    more than one.
     """
     shapes = [output.shape for output in outputs]
     fitting: tuple[str, ...] = ()
@@ -206,13 +195,9 @@ def select_named_people(names: Mapping[int, str]) -> tuple[int, ...]:
 def find_person_classes(
     where: str, count: int | None, names: Mapping[int, str], asked: Sequence[int] | None
 ) -> tuple[int, ...]:
-    """Return the classes of people of a net.
+    """Return the classes of people of a net, of which `count`, if known, have `names` or {}.
 
-    Args:
-        where: its file, for messages.
-        count: number of its classes; None = not known.
-        names: names of its classes; {} if it has none.
-        asked: `detection.person_classes`.
+    `where` is its file, for messages, and `asked` is `detection.person_classes`.
     """
     if asked is not None:
         if count is not None and any(number >= count for number in asked):

@@ -36,22 +36,12 @@ class OnnxNet:
         where: the file, for messages.
         size: width, height of its input [px].
         channels_last: whether it takes (batch, height, width, 3), as TensorFlow has it.
-        dtype: dtype of its input.
         metadata: what the exporter wrote into the file.
         outputs: shape of each output, with None for dynamic sizes.
     """
 
     def __init__(self, file: Path, device: str, default_size: tuple[int, int]) -> None:
-        """Load a file.
-
-        Args:
-            file: the net.
-            device: `cpu` or `cuda`.
-            default_size: width, height [px] for a net that takes any.
-
-        Raises:
-            InputError: onnxruntime or a GPU for it is missing, or the file is no such net.
-        """
+        """Load a file as `open_session`; `default_size`, width, height [px], is for nets of any."""
         self.where = str(file)
         self._session = open_session(file, device)
         inputs = self._session.get_inputs()
@@ -98,14 +88,9 @@ class OnnxNet:
 
 
 def open_session(file: Path, device: str) -> Any:  # noqa: ANN401
-    """Return an onnxruntime session of one thread.
+    """Return an onnxruntime session of one thread on `cpu` or `cuda`.
 
-    Args:
-        file: the net.
-        device: `cpu` or `cuda`.
-
-    Raises:
-        InputError: onnxruntime or a GPU for it is missing, or the file is no net.
+    InputError if onnxruntime or a GPU for it is missing, or the file is no net.
     """
     where = str(file)
     runtime = import_library("onnxruntime", where)
@@ -135,11 +120,7 @@ def open_session(file: Path, device: str) -> Any:  # noqa: ANN401
 
 
 def import_library(name: str, where: str) -> ModuleType:
-    """Return a library that computes nets.
-
-    Raises:
-        InputError: it is not installed.
-    """
+    """Return a library that computes nets; InputError if it is not installed."""
     try:
         return import_module(name)
     except ImportError as error:
@@ -152,18 +133,11 @@ def import_library(name: str, where: str) -> ModuleType:
 
 
 def load_onnx_pose(file: Path, device: str = "cpu") -> PoseEstimator:
-    """Return a pose estimator from an ONNX file.
+    """Return a pose estimator from an ONNX file, on `cpu` or `cuda`; errors as of `open_session`.
 
-    The shape of the outputs decides how they are read: (batch, 1, 17, 3) of MoveNet, y, x and
-    score in 0..1; two outputs (batch, 17, n) of RTMPose, a score for every column and row; (batch,
-    17, height, width) heat maps. Crops are RGB, 0..255 for MoveNet, else normalized as ImageNet.
-
-    Args:
-        file: the net.
-        device: `cpu` or `cuda`.
-
-    Raises:
-        InputError: onnxruntime is not installed, or the file is no such net.
+    The shape of the outputs decides how they are read: (batch, 1, 17, 3) of MoveNet, y, x and score
+    in 0..1; two outputs (batch, 17, n) of RTMPose, a score for every column and row; (batch, 17,
+    height, width) heat maps. Crops are RGB, 0..255 for MoveNet, else normalized as ImageNet.
     """
     # Input size for a net that takes any size [px].
     net = OnnxNet(file, device, (192, 256))
@@ -229,11 +203,9 @@ def _from_columns(across: Floats, down: Floats, size: tuple[int, int]) -> tuple[
 
 
 def from_heat_maps(maps: Floats, size: tuple[int, int]) -> tuple[Floats, Floats]:
-    """Return the subcell peak of each map, from its neighbour cells, and its height.
+    """Return the subcell peak of maps (boxes, 17, rows, columns), and its height.
 
-    Args:
-        maps: (boxes, 17, rows, columns).
-        size: width, height of the crop [px].
+    Neighbour cells tell it; `size` is width, height of the crop [px].
     """
     count, joints, rows, columns = maps.shape
     flat = maps.reshape(count, joints, -1)

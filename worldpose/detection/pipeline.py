@@ -38,18 +38,12 @@ from worldpose.pitch.template import PitchTemplate
 def on_pitch(
     boxes: Floats, camera: Camera, image_size: tuple[int, int], pitch: PitchTemplate, margin: float
 ) -> Flags:
-    """Return whether people stand on the pitch or within a margin around it (people,).
+    """Return whether people stand on the pitch or within a margin [m] around it (people,).
 
-    The middle of a box's lower edge is where the feet touch the ground. The ray to a spectator in
-    a stand meets the ground farther away than any margin. If the image border cuts off the feet,
-    the head position decides, at a person's height above the ground.
-
-    Args:
-        boxes: (people, 4) x0, y0, x1, y1 [px].
-        camera: the camera that took the frame.
-        image_size: width, height [px].
-        pitch: its lines and its surface.
-        margin: largest distance outside of the lines that still counts as on the pitch [m].
+    The middle of a box's lower edge is where the feet touch the ground. The ray to a spectator in a
+    stand meets the ground farther away than any margin. If the image border cuts off the feet, the
+    head position decides, at a person's height above the ground. Boxes are (people, 4) x0, y0, x1,
+    y1 [px], images of a width, height [px].
     """
     # The lower border cuts off a box that ends this near to it [px].
     cut = boxes[:, 3] > image_size[1] - 1 - 3.0
@@ -134,10 +128,7 @@ class DetectionReport:
         return {"images_per_s": self.frames / whole, **shares}
 
     def why_no_person(self) -> str | None:
-        """Return the likely reason why a clip of 20 frames or more shows no person.
-
-        None: people were found, or the clip is shorter.
-        """
+        """Return the likely reason why a clip of 20 frames or more shows no person; else None."""
         frames = self.frames - len(self.unreadable)
         if self.detections or frames < 20:
             return None
@@ -168,23 +159,14 @@ class DetectionReport:
 
 @dataclass(frozen=True)
 class Place:
-    """Camera and pitch, which separate the crowd from the players.
-
-    Attributes:
-        camera: the calibrated camera.
-        pitch: the pitch in its view; None = there is none, and everyone counts.
-    """
+    """Camera and pitch, which separate crowd from players; without a pitch, everyone counts."""
 
     camera: Camera
     pitch: PitchTemplate | None
 
 
 class PeopleFinder:
-    """Detectors, an estimator and settings, for a match's videos.
-
-    Attributes:
-        report: report of the last video.
-    """
+    """Detectors, an estimator and settings, for a match's videos; `report` is the last one's."""
 
     def __init__(
         self,
@@ -194,15 +176,11 @@ class PeopleFinder:
         score_map: ScoreMap | None = None,
         landmarks: PointEstimator | None = None,
     ) -> None:
-        """Combine detectors, an estimator and settings.
+        """Combine detectors, one or an ensemble, an estimator and settings.
 
-        Args:
-            detectors: one, or an ensemble.
-            estimator: finds keypoints in boxes.
-            settings: settings of the stage. Its thresholds apply to the nets' own scores.
-            score_map: makes probabilities of the scores of the people found, at the very end;
-                None = not known, scores stay.
-            landmarks: finds points besides COCO-17 of the people found; None = none.
+        The settings' thresholds apply to the nets' own scores; at the very end, `score_map` makes
+        probabilities of them, None = not known. `landmarks` finds points besides COCO-17; None =
+        none.
         """
         self._detectors = [as_frame_detector(each, settings) for each in detectors]
         self._estimator, self._settings, self._score_map = estimator, settings, score_map
@@ -222,15 +200,11 @@ class PeopleFinder:
         Nets know people who stand: images of a camera that the calibration shows to be mounted on
         its side or upside down are turned, if the nets then find more in some of them.
 
-        Args:
-            frames: numbers that rise by one, each with its image (height, width, 3) RGB of bytes;
-                None where there is none.
-            place: camera and pitch; None keeps the crowd.
-            given: known people by frame, in place of those of the detectors, all of whom stay: no
-                box is added, left out because of its score or its place, or tracked. None = detect.
-
-        Raises:
-            InputError: an image has another form or size than the first, or than the camera's.
+        Numbers of frames rise by one, each with its image (height, width, 3) RGB of bytes, None
+        where there is none. Without a place, the crowd stays. Known people, `given` by frame,
+        replace those of the detectors, and all stay: no box is added, left out because of its score
+        or its place, or tracked. InputError for an image of another form or size than the first, or
+        the camera's.
         """
         frames = _require_rgb(frames, place)
         self.report = DetectionReport(is_given=given is not None)

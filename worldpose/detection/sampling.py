@@ -90,13 +90,9 @@ def resize(view: View, into: Image | None = None) -> Frame:
 
 
 def pad(views: Sequence[View], shape: Sequence[int]) -> Frame:
-    """Return views (n, height, width, 3), grey to the right of and below each.
+    """Return views (n, height, width, 3), grey to the right of and below smaller ones of any size.
 
     On a CPU the thread's next call overwrites them.
-
-    Args:
-        views: smaller ones of any size.
-        shape: height, width [px].
     """
     whole, first = (len(views), *shape, 3), views[0][0]
     batch = first.new_empty(whole) if isinstance(first, Tensor) else borrow("views", whole)
@@ -112,18 +108,12 @@ def pad(views: Sequence[View], shape: Sequence[int]) -> Frame:
 def sample_crops(
     images: Sequence[Image], boxes: Sequence[Floats], others: Sequence[Floats], device: str
 ) -> tuple[Floats, Frame, Singles]:
-    """Return a crop around each box of some frames, and maps of the boxes around it.
+    """Return a crop around each box of some frames of one size, and maps of the boxes around it.
 
-    Args:
-        images: frames of one size.
-        boxes: (people, 4) x0, y0, x1, y1 [px], at least one, for each frame.
-        others: (people, 4) boxes of the neighbours of each person of all frames [px].
-        device: `cpu` or `cuda`.
-
-    Returns:
-        Maps from pixels of the crops to those of the frames (crops, 2, 3), crops (crops, height,
-        width, 3) of bytes, which the thread's next call overwrites on a CPU, and maps (crops, 3,
-        rows, columns).
+    Boxes are (people, 4) x0, y0, x1, y1 [px], at least one, for each frame, `others` (people, 4)
+    those of the neighbours of each person of all frames. Returned are maps from pixels of the crops
+    to those of the frames (crops, 2, 3), and crops (crops, height, width, 3) of bytes. On a CPU the
+    thread's next call overwrites these. Last are maps of boxes (crops, 3, rows, columns).
     """
     flat = np.concatenate(boxes)
     mappings = frame_from_crop(crops_around(flat), CROP)

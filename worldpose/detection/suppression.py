@@ -17,9 +17,7 @@ from worldpose.geometry.boxes import box_areas, box_iou
 def nms_indices(people: People, overlap: float) -> NDArray[np.intp]:
     """Return the indices of boxes that pass non-maximum suppression, best first.
 
-    Args:
-        people: people of one frame.
-        overlap: a better box with a larger intersection over union suppresses a box [1].
+    A better box with an intersection over union above `overlap` [1] suppresses a box.
     """
     order = _best_first(people)
     boxes = people.boxes[order]
@@ -36,10 +34,9 @@ def suppress(people: People, overlap: float) -> People:
 
 
 def surest_confidence(confidence: AnyFloats) -> Floats:
-    """Return the mean confidence of the twelve surest keypoints; others may be hidden.
+    """Return the mean of a person's twelve surest confidences (people, 17); others may be hidden.
 
-    Args:
-        confidence: (people, 17); NaN where not found, which counts as 0.
+    A keypoint that was not found, NaN, counts as 0.
     """
     return np.asarray(np.sort(np.nan_to_num(confidence), axis=1)[:, -12:].mean(axis=1))
 
@@ -55,18 +52,12 @@ def combine_boxes(people: People, poses: KeypointDetections) -> KeypointDetectio
 
 
 def fuse(members: list[People], overlap: float) -> People:
-    """Return one box per person from the detections of an ensemble, best first.
+    """Return one box per person from the detections of an ensemble in one frame, best first.
 
-    Weighted boxes fusion: a box joins the best scored cluster that it overlaps. A cluster's box is
-    the mean of its boxes weighted by score. Its score is the sum of their scores over the number of
-    members, so a person that only one member detects scores less.
-
-    Args:
-        members: detections of each detector in one frame.
-        overlap: boxes with a larger intersection over union are of one person [1].
-
-    Note:
-        Solovyev et al., Weighted boxes fusion, 2021.
+    Weighted boxes fusion (Solovyev et al., 2021): a box joins the best scored cluster that it
+    overlaps, by an intersection over union above `overlap` [1]. A cluster's box is the mean of its
+    boxes weighted by score. Its score is the sum of their scores over the number of members, so a
+    person that only one member detects scores less.
     """
     each = [suppress(member, overlap) for member in members]
     if len(each) == 1:
@@ -101,9 +92,8 @@ def _best_first(people: People) -> NDArray[np.intp]:
 def object_keypoint_similarity(keypoints: AnyFloats, area: AnyFloats) -> Floats:
     """Return COCO's object keypoint similarity of every pair of poses (people, people) [1].
 
-    Args:
-        keypoints: (people, 17, 2) [px]; NaN where not found.
-        area: (people,) area of their boxes [px^2]; the smaller of a pair counts.
+    Keypoints are (people, 17, 2) [px], NaN where not found; the smaller area (people,) [px^2] of a
+    pair's boxes counts.
     """
     x, y = np.moveaxis(keypoints, -1, 0)
     apart = np.square(x[:, None] - x) + np.square(y[:, None] - y)
@@ -118,15 +108,12 @@ def object_keypoint_similarity(keypoints: AnyFloats, area: AnyFloats) -> Floats:
 def suppress_poses(
     detections: KeypointDetections, least_keypoint: float, same_pose: float
 ) -> KeypointDetections:
-    """Return the people that have a pose different from that of every better box.
+    """Return an image's people (people,) with another pose than that of every better box.
 
     The more a pose resembles that of a better box, the lower its score falls (soft suppression,
-    Bodla, 2017): a person behind another stays, a duplicate ranks last.
-
-    Args:
-        detections: (people,) detections of one image.
-        least_keypoint: a keypoint below this confidence was not found [1].
-        same_pose: similarity of poses above which two boxes are of one person [1].
+    Bodla, 2017): a person behind another stays, a duplicate ranks last. A keypoint below a
+    confidence of `least_keypoint` was not found; poses more similar than `same_pose` are of one
+    person [1].
     """
     with np.errstate(invalid="ignore"):
         found = detections.confidence >= least_keypoint

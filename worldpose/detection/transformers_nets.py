@@ -26,17 +26,11 @@ class TransformersDetector:
     def __init__(
         self, folder: Path, device: str, half: bool, person_classes: Sequence[int] | None = None
     ) -> None:
-        """Load a saved checkpoint.
+        """Load a saved checkpoint: config.json, model.safetensors and preprocessor_config.json.
 
-        Args:
-            folder: folder with config.json, model.safetensors and preprocessor_config.json.
-            device: `cpu` or `cuda`.
-            half: compute in half precision, on a GPU only.
-            person_classes: as of `load_onnx_detector`, for a net whose names tell no people.
-
-        Raises:
-            InputError: transformers or a GPU is missing, the folder holds no such net, or its
-                classes of people are unknown.
+        Arguments are as of `load_bundled_detector`, and person_classes as of `load_onnx_detector`,
+        for a net whose names tell no people. InputError if transformers or a GPU is missing, the
+        folder holds no such net, or its classes of people are unknown.
         """
         self._torch, library = (import_library(n, str(folder)) for n in ("torch", "transformers"))
         # Kinds of detectors, by `model_type` of config.json.

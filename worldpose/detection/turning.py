@@ -17,11 +17,9 @@ from worldpose.geometry.rigid import Rigid
 
 @dataclass(frozen=True)
 class QuarterTurn:
-    """A turn of images by quarters, after which people stand upright.
+    """A turn of images of a width, height [px] by quarters, after which people stand upright.
 
-    Attributes:
-        quarters: counterclockwise, as in np.rot90: 1 to 3.
-        size: width, height of the camera's images [px].
+    They are counterclockwise, as in np.rot90: 1 to 3.
     """
 
     quarters: int

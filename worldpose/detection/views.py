@@ -44,13 +44,11 @@ class TiledDetector:
     def __init__(
         self, detector: Detector, zooms: Sequence[float], view_overlap: float, overlap: float
     ) -> None:
-        """Wrap a detector.
+        """Wrap a detector with a view size.
 
-        Args:
-            detector: one with a view size.
-            zooms: frames are scaled by each and cut, in addition to one view of the whole frame.
-            view_overlap: share of a view that its neighbour shows too.
-            overlap: boxes with a larger intersection over union are of one person [1].
+        Frames are scaled by each of the zooms and cut, in addition to one view of the whole frame.
+        Neighbours share `view_overlap` of a view; boxes with an intersection over union above
+        `overlap` [1] are of one person.
         """
         assert detector.view_size is not None  # others take frames whole
         self._detector, self._size = detector, detector.view_size

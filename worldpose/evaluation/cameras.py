@@ -62,10 +62,8 @@ def evaluate_cameras(
     """Return errors of all static and all broadcast cameras, and of each camera.
 
     Cameras are single or batches (frames,), by id; ids that only one side has are skipped. Without
-    a pitch there are neither ground nor reprojection errors.
-
-    Raises:
-        InputError: an estimated and a true camera have different numbers of frames.
+    a pitch there are neither ground nor reprojection errors. InputError for other numbers of
+    frames.
     """
     settings = settings or CameraErrorSettings()
     names = [name for name in true if name in estimated]
@@ -97,9 +95,7 @@ def camera_samples(
 
     Each camera is single, or a batch (frames,); the estimated one is NaN in frames without an
     estimate. Without a pitch there are no points. The name of the camera or clip is for messages.
-
-    Raises:
-        InputError: the cameras have different numbers of frames.
+    InputError if the cameras have different numbers of frames.
     """
     frames = max(_frames(estimated), _frames(true))
     if {_frames(estimated), _frames(true)} - {1, frames}:
@@ -140,9 +136,7 @@ def camera_samples(
 def surface_points(rays: Rays, pitch: PitchTemplate) -> Floats:
     """Return the first intersections of rays from above with the pitch surface (..., 3) [m], world.
 
-    NaN if a ray is missing or passes above the horizon.
-
-    The surface extends beyond the touch lines.
+    NaN if a ray is missing or passes above the horizon. The surface goes on beyond the touch lines.
     """
     newton_steps = 8  # each step squares the error; the surface is within 0.2 m of the start plane
     origins, directions = rays.origins, rays.directions

@@ -37,12 +37,9 @@ class ChallengeScore(NamedTuple):
 def score_submission(prediction: Path, reference: Path) -> dict[str, ChallengeScore]:
     """Return the scores by clip, and of `ALL` joints together.
 
-    A person is the same row on both sides, as in the challenge, which gives the boxes.
-
-    Predictions are a zip, npz or parquet; true poses are in the same layout, NaN without a person.
-
-    Raises:
-        InputError: a clip, person or pose of the reference is missing in the prediction.
+    A person is the same row on both sides, as in the challenge, which gives the boxes. Predictions
+    are a zip, npz or parquet; true poses are in the same layout, NaN without a person. InputError
+    if a clip, person or pose of the reference is missing in the prediction.
     """
     true = read_submission(reference)
     found = read_submission(prediction)

@@ -57,11 +57,7 @@ class Markers:
 
 
 def read_markers(path: Path) -> Markers:
-    """Return the markers of a C3D or TRC file.
-
-    Raises:
-        InputError: the file is unreadable, has no unit, or c3d is not installed.
-    """
+    """Return the markers of a C3D or TRC file; InputError without a unit or c3d's library."""
     if not path.is_file():
         raise _wrong(path, "a C3D or TRC file", "nothing")
     if path.suffix.lower() == ".c3d":
@@ -85,11 +81,7 @@ def map_marker_names(names: tuple[str, ...]) -> dict[str, dict[str, tuple[str, .
 
 
 def read_marker_map(path: Path) -> dict[str, dict[str, tuple[str, ...]]]:
-    """Return people and joints of a YAML file: `person: {joint: marker, joint: [marker, ...]}`.
-
-    Raises:
-        InputError: the file has another structure, or a joint is not in COCO-17.
-    """
+    """Return people and joints of a YAML file: `person: {joint: marker, joint: [marker, ...]}`."""
     expected = "YAML: person: {joint: [marker, ...]}"
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -112,10 +104,8 @@ def read_marker_map(path: Path) -> dict[str, dict[str, tuple[str, ...]]]:
 def marker_joints(markers: Markers, people: People) -> Floats:
     """Return joints (samples, persons, 17, 3) [m] in the system's world; NaN where missing.
 
-    A joint is the mean of its markers, and missing if one of them is missing.
-
-    Raises:
-        InputError: there is no person, or the file lacks a marker or has it twice.
+    A joint is the mean of its markers, and missing if one of them is missing. InputError if there
+    is no person, or the file lacks a marker or has it twice.
     """
     if not people:
         raise _wrong(
@@ -220,8 +210,7 @@ def _read_trc(path: Path) -> tuple[float, tuple[str, ...], Floats, str, float]:
 def _samples(path: Path, number: Floats, time: Floats) -> Integers:
     """Return the sample of each row, from 0, by its Frame# (rows,), or else its time [samples].
 
-    Raises:
-        InputError: neither rises; or rows are missing for longer than any recording.
+    InputError if neither rises, or rows are missing for longer than any recording.
     """
     most = 10_000_000
     for each in (number, time):
@@ -283,15 +272,12 @@ def align_reference(
 
     The clock offset minimizes the distance: a grid search with a new registration of people at each
     offset, then a refinement with fixed matches. The motion is rigid: a wrong size of the
-    prediction remains an error.
+    prediction remains an error. DegenerateError if they match at no offset.
 
     `joints` (samples, persons, 17, 3) [m] are in the reference's world, NaN where missing, at
     `rate` samples per second [1/s], the first one at `start` [s] of the clock. The clock of a part
     of a recording may also count from its first sample, and that of a file from the prediction's
     first frame, as `write_c3d` does.
-
-    Raises:
-        DegenerateError: prediction and reference match at no offset.
     """
     # Step of the initial grid over clock offsets [s]: a walk of 30 cm, within the gate.
     step_s = 0.2

@@ -71,11 +71,8 @@ def identity_scores(
     """Return the identity scores of predicted tracks against true people.
 
     `distances` (frames, true, predicted persons) [m] are infinite where either is absent; `gate`
-    [m] is the maximum of a match.
-
-    Note:
-        IDF1: Ristani et al., ECCV-W 2016. Switches and fragmentations: Bernardin and Stiefelhagen,
-        2008, as counted by MOTChallenge. HOTA: Luiten et al., IJCV 2021.
+    [m] is the maximum of a match. IDF1: Ristani et al., ECCV-W 2016. Switches and fragmentations:
+    Bernardin and Stiefelhagen, 2008, as counted by MOTChallenge. HOTA: Luiten et al., IJCV 2021.
     """
     both = true_exists[:, :, None] & predicted_exists[:, None, :]
     distances = np.where(both, distances, np.inf)
@@ -264,10 +261,7 @@ def merge_tracks(pairs: Integers, cost: Floats) -> Integers:
 
 
 def take_matched(people: Floats, match: Integers) -> Floats:
-    """Return predicted people in the order of the true ones (frames, true, joints, 3).
-
-    The match (frames, true persons) has the index of the predicted person; -1, none, gives NaN.
-    """
+    """Return predicted people in the order of `match` (frames, true persons), NaN for -1, none."""
     if not people.shape[1]:
         return np.full((*match.shape, *people.shape[2:]), np.nan)
     chosen = np.take_along_axis(people, np.maximum(match, 0)[..., None, None], axis=1)
@@ -376,10 +370,7 @@ def match_tracks(
     `people` and `true` are (frames, persons, 17, 3) [m], NaN where missing, `distances` (frames,
     true, predicted persons) [m], `match` (frames, true persons) the matches by these. With a
     camera, boxes in its image are compared: `boxes` (frames, predicted persons, 4) [px], or those
-    of the joints.
-
-    Raises:
-        InputError: camera and truth have different numbers of frames.
+    of the joints. InputError if the camera has another number of frames.
     """
     if camera is not None:
         if camera.batch_shape not in ((), (1,), (len(true),)):

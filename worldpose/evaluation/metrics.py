@@ -44,11 +44,7 @@ mid-shoulder to the middle of the ears."""
 
 
 def limb_ends(joints: Floats) -> Floats:
-    """Return both ends of every limb of COCO-17 joints (..., 17, 3) [m]; NaN where one is missing.
-
-    Returns:
-        (..., 10, 2, 3) [m], in the order of `LIMBS`.
-    """
+    """Return both ends (..., 10, 2, 3) [m] of the `LIMBS` of joints (..., 17, 3) [m], or NaN."""
     return np.stack(
         [
             np.stack([joints[..., list(end), :].mean(axis=-2) for end in ends], axis=-2)
@@ -61,11 +57,9 @@ def limb_ends(joints: Floats) -> Floats:
 def correct_limbs(predicted: Floats, true: Floats, alpha: float) -> Flags:
     """Return a mask of correct limbs (..., 10): mean error of ends at most alpha times length.
 
-    Joints are (..., 17, 3) [m]; a limb with a missing joint is wrong.
-
-    Note:
-        Burenius et al., CVPR 2013, in the form used for Shelf and Campus: the mean of both errors
-        is below the bound, not each error as in the original form.
+    Joints are (..., 17, 3) [m]; a limb with a missing joint is wrong. It is the form used for Shelf
+    and Campus: the mean of both errors is below the bound, not each as in Burenius et al., CVPR
+    2013.
     """
     true_ends = limb_ends(true)
     error = np.linalg.norm(limb_ends(predicted) - true_ends, axis=-1).mean(axis=-1)
@@ -91,10 +85,7 @@ def mid_hip(joints: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class AlignedErrors:
-    """Joint distances after alignment; NaN where a joint is missing on either side.
-
-    Distances are (frames, persons, 14) [m], on `paper_joints`.
-    """
+    """Joint distances (frames, persons, 14) [m] of `paper_joints` once aligned, NaN if missing."""
 
     shared: Floats
     """One alignment for all people's whole trajectories."""
@@ -159,11 +150,9 @@ def path_lengths(true: Floats, compared: Flags) -> Floats:
 def drift_per_meter(errors: Floats, lengths: Floats, min_length: float) -> float | None:
     """Return the mean over people of mean error over path length [1], None without long paths.
 
-    Errors are (frames, persons, joints) [m], NaN where missing; path lengths (persons,) [m].
-
-    Note:
-        The ratio of the published columns does not give the published drift, so that the drift
-        is no ratio of means over all people; this function averages the ratio of each trajectory.
+    Errors are (frames, persons, joints) [m], NaN where missing; path lengths (persons,) [m]. The
+    ratio of the published columns does not give the published drift: it is the mean of
+    trajectories' ratios.
     """
     known = np.isfinite(errors)
     count = known.sum((0, 2))

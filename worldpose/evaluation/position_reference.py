@@ -24,10 +24,7 @@ def read_positions(path: Path) -> tuple[Integers, tuple[str, ...], Floats, float
 
     The file is a CSV of `worldpose export --format positions`, or of kloppy's `to_df`: columns
     `<player>_x` and `<player>_y`, or `player_id`, x and y, beside `frame_id`. The ball is left out.
-    An archive may hold it.
-
-    Raises:
-        InputError: the file has another form, or places that cannot be metres from the centre spot.
+    An archive may hold it. InputError for places that cannot be metres from the centre spot.
     """
     import pandas as pd  # late: it takes half a second
 
@@ -119,14 +116,11 @@ def align_positions(
     """Return a prediction and given places as tracks on the ground, and what was found.
 
     Axes of providers may point the other way: of the four ways, the one is taken that clearly
-    agrees with the prediction.
+    agrees with the prediction; InputError if none does.
 
     `first` is the match frame of the file's first row; None = its frames are match frames. At
     another rate than the match's (`fps`), by the file's times or by the best agreement of usual
     rates, match frame 0 is still frame 0.
-
-    Raises:
-        InputError: the file is invalid, or no way of its axes clearly agrees.
     """
     most, hips = 1.0, [11, 12]  # largest median distance of one person in both [m]
     numbers, names, given, rate = read_positions(path)

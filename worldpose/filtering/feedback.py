@@ -58,9 +58,8 @@ def apply_feedback(name: str, values: Singles, feedback: Feedback) -> Singles:
 def align_results(before: NDArray[Any], redetected: Flags) -> NDArray[Any]:
     """Return results for earlier detections by current ones; zero for new and redetected ones.
 
-    Args:
-        before: (frames, cameras, earlier detections, ...).
-        redetected: (frames, cameras, detections), people redetected since.
+    They are (frames, cameras, earlier detections, ...), `redetected` (frames, cameras, detections)
+    since.
     """
     out = np.zeros((*redetected.shape, *before.shape[3:]), dtype=before.dtype)
     both = min(redetected.shape[2], before.shape[2])

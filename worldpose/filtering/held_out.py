@@ -21,11 +21,9 @@ measure the accuracy of a person's position."""
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Prediction error of keypoints in held-out cameras.
+    """Prediction error of so many keypoints in held-out cameras.
 
-    Attributes:
-        error: mean distance to the nearest person predicted by the other cameras [box height].
-        keypoints: number of keypoints.
+    It is the mean distance to the nearest person predicted by the other cameras [box height].
     """
 
     error: float
@@ -39,13 +37,9 @@ def measure_held_out(
 
     One quarter of the cameras after the other is held out; the others triangulate all people, and
     every keypoint detected in the held-out cameras is compared with them. The compared keypoints do
-    not depend on tracking or rejection, so leaving detections out cannot reduce the error.
-
-    Args:
-        cameras: batch (cameras,).
-        used: detections for triangulation; NaN where rejected.
-        detected: (frames, cameras, detections, 17, 2) [px], all keypoints; NaN where not found.
-        settings: settings of triangulation.
+    not depend on tracking or rejection, so leaving detections out cannot reduce the error. `used`
+    are NaN where rejected, `detected` (frames, cameras, detections, 17, 2) [px] are all, NaN where
+    not found.
     """
     count = cameras.batch_shape[0]
     folds = 4  # Groups of cameras; each is held out once.

@@ -63,12 +63,10 @@ class BodyViews:
 
 
 def view_bodies(cameras: Camera, joints: Floats, covariance: Floats) -> BodyViews:
-    """Return projections of bodies into all images.
+    """Return projections of bodies into all images of a batch (cameras,).
 
-    Args:
-        cameras: batch (cameras,).
-        joints: (frames, persons, 17, 3) [m], world, the detector's joints; NaN without a body.
-        covariance: (frames, persons, 17, 3, 3) [m^2].
+    The detector's joints (frames, persons, 17, 3) [m], world, NaN without a body, have a covariance
+    (frames, persons, 17, 3, 3) [m^2].
     """
     frames, persons = joints.shape[:2]
     count = cameras.batch_shape[0]
@@ -114,11 +112,9 @@ class Spread:
 def learn_spread(squared: Floats, stated: Floats, known: Floats, confidence: Floats) -> Spread:
     """Return the spread of keypoints about bodies, from medians, which outliers hardly move.
 
-    Args:
-        squared: (n, 17) squared distance of each keypoint to its body [px^2]; NaN = none.
-        stated: (n, 17) stated variance of keypoints per axis [px^2].
-        known: (n, 17) variance of the body's joint per axis [px^2].
-        confidence: (n, 17).
+    Keypoints have a squared distance (n, 17) [px^2] to their body, NaN = none, and a stated
+    variance (n, 17) per axis [px^2]. `known` (n, 17) [px^2] is that of the body's joint per axis.
+    The confidence is (n, 17).
     """
     seen = np.isfinite(squared) & np.isfinite(known)
     sure = confidence[seen]
@@ -172,8 +168,7 @@ class TriangulatedDetections:
     def subtract(self, shift: Floats) -> TriangulatedDetections:
         """Return the detections with the systematic errors of their keypoints subtracted.
 
-        Args:
-            shift: (frames, cameras, persons, 17, 2) [px], of the bodies' joints; NaN = unknown.
+        The shift (frames, cameras, persons, 17, 2) [px] is of the bodies' joints; NaN = unknown.
         """
         keypoints = self.detections.keypoints - self.assign_to_detections(shift)
         return replace(self, detections=replace(self.detections, keypoints=keypoints))
@@ -183,10 +178,8 @@ class TriangulatedDetections:
     ) -> TriangulatedDetections:
         """Return the detections with the effect of clock offsets subtracted from `offsets`.
 
-        Args:
-            clock_offsets: (cameras,) [frame].
-            image_motion: (frames, cameras, persons, 17, 2) [px], of joints per frame; NaN =
-                unknown.
+        Clock offsets are (cameras,) [frame]; `image_motion` (frames, cameras, persons, 17, 2) [px]
+        is that of joints per frame; NaN = unknown.
         """
         part = clock_offsets[:, None, None] * np.nan_to_num(image_motion.mean(axis=-2))
         return replace(self, offsets=self.offsets - part)
@@ -195,10 +188,8 @@ class TriangulatedDetections:
         """Return the shift of each detection (frames, cameras, detections, 17, 2) [px].
 
         It is 0 for a detection of no person, and where it is unknown. In a left-right swap, a
-        keypoint gets the shift of the joint that it shows.
-
-        Args:
-            shift: (frames, cameras, persons, 17, 2) [px], of the bodies' joints; NaN = unknown.
+        keypoint gets the shift of the joint that it shows. The shift (frames, cameras, persons, 17,
+        2) [px] is of the bodies' joints; NaN = unknown.
         """
         frame, camera, person = np.nonzero(self.detections.detection_index >= 0)
         order = _order_joints(self.exchanged[frame, camera, person])
@@ -409,9 +400,8 @@ def _find_best_bodies(
 ) -> tuple[tuple[Places, Places], Places, Floats, Floats]:
     """Return the bodies that a frame's open detections (cameras, detections) fit best.
 
-    Returns:
-        Cameras and indices (n,) of the detections that fit a body, and of each: the index of the
-        person, the similarity of bones [1], and distances (n, 17) in standard deviations.
+    Returned are cameras and indices (n,) of the detections that fit a body, and of each: the index
+    of the person, the similarity of bones [1], and distances (n, 17) in standard deviations.
     """
     camera, place = np.nonzero(open_)
     persons = views.image.shape[2]

@@ -59,12 +59,9 @@ class Expected:
 
     @classmethod
     def of(cls, views: BodyViews, offset: Floats, focal: float) -> Expected:
-        """Return the expected image of the bodies in the only camera of `views`.
+        """Return the expected image of bodies in the one camera of `views`, of a focal length [px].
 
-        Args:
-            views: bodies in the frames of one camera.
-            offset: (frames, persons, 17, 2) [px] expected offset of keypoints from the joints.
-            focal: focal length of the camera [px].
+        The offset (frames, persons, 17, 2) [px] of keypoints from the joints is the expected one.
         """
         scale = views.scale[:, 0]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -138,13 +135,9 @@ def select_missing_people(
 ) -> MissingPeople:
     """Return the people that should be visible and have no detection.
 
-    Args:
-        expected: the bodies in view of one camera.
-        seen: (frames, persons) whether the person was detected there.
-        size: width, height of the frames [px].
-        settings: thresholds of visibility.
-        place: camera and pitch; None where there is no pitch.
-        margin: largest distance outside of the lines that still counts as on the pitch [m].
+    `seen` (frames, persons) is whether the person was detected there, `size` the width, height of
+    the frames [px]. Where there is a pitch, a place up to `margin` [m] outside of the lines is on
+    it.
     """
     boxes = expected.boxes
     with np.errstate(invalid="ignore"):
@@ -172,10 +165,8 @@ def find_detected_people(
 ) -> Flags:
     """Return which people have detections (frames, persons) that fit or could not be judged.
 
-    Args:
-        index: (frames, persons), index of the camera's detection; -1 = not seen.
-        fits: (frames, detections), index of the person whose body each fits; -1 = none.
-        dropped: (frames, detections), that fit no body.
+    `index` (frames, persons) is that of the camera's detection, -1 = not seen. Detections fit,
+    (frames, detections), a person's body, -1 = none, or are dropped as they fit no body.
     """
     detections = fits.shape[1]
     seen = np.zeros(index.shape, dtype=np.bool_)
@@ -223,15 +214,9 @@ def search_missing_people(
     """Return the poses that an estimator finds in predicted boxes.
 
     The detections are those of the rows of `sought` (n,); they are missing where there was no
-    image, and scores are comparable with those of a detector.
-
-    Args:
-        pictures: images by index of the frame, at least the frames to search in.
-        sought: people and boxes.
-        estimator: estimator of poses.
-        least_keypoint: a keypoint below this confidence was not found [1].
-        detected: (frames, detections, 4) boxes of detections [px]: an estimator may separate people
-            by the boxes of their neighbours.
+    image, and scores are comparable with those of a detector. A keypoint below a confidence of
+    `least_keypoint` was not found [1]. An estimator may separate people by the boxes of their
+    neighbours, `detected` (frames, detections, 4) [px].
     """
     shape = (len(sought.frame), 17)
     found = KeypointDetections(
@@ -272,16 +257,9 @@ def judge_search_results(
 
     A result is accepted if the estimator is confident, if it agrees with the body within the
     uncertainty of both, and if it is no other person's: no other body explains it better, and
-    neither a detection in the frame nor a better result has that pose already.
-
-    Args:
-        results: results of the estimator.
-        sought: the people of these results.
-        expected: all bodies in view of the camera.
-        detected: the detections (frames, detections) in all frames of the camera.
-        spread: spread of keypoints around bodies.
-        noise: stated standard deviation of keypoints, [px] and [m].
-        settings: acceptance thresholds.
+    neither a detection in the frame nor a better result has that pose already. `expected` are all
+    bodies in view of the camera, `detected` (frames, detections) all of its detections; the noise
+    of keypoints is [px] and [m].
     """
     agrees, rejected = _compare_with_bodies(results, sought, expected, spread, noise, settings)
     unsure = ~(surest_confidence(results.confidence) >= settings.min_confidence)

@@ -62,9 +62,8 @@ class ViewBias:
     def shift(self, azimuth: NDArray[np.floating], scale: NDArray[np.floating]) -> Floats:
         """Return the bias of keypoints (..., 17, 2) [px].
 
-        Args:
-            azimuth: (...) azimuth of the camera seen from the body [rad]; NaN = unknown.
-            scale: (...) [px/m].
+        The azimuth (...) [rad] is that of the camera seen from the body, NaN = unknown, the scale
+        (...) [px/m].
         """
         waves = _waves(azimuth) * np.asarray(scale)[..., None]
         return np.asarray(np.einsum("...w,jaw->...ja", waves, self.coefficient))
@@ -73,11 +72,8 @@ class ViewBias:
 def find_azimuths(cameras: Camera, joints: Floats) -> Floats:
     """Return the azimuth of each camera as seen from bodies (frames, cameras, persons) [rad].
 
-    0 is in front of a body, a quarter turn to its left; NaN without a body.
-
-    Args:
-        cameras: batch (cameras,).
-        joints: (frames, persons, 17, 3) [m], world.
+    0 is in front of a body, a quarter turn to its left; NaN without a body. Joints are (frames,
+    persons, 17, 3) [m], world.
     """
     axes = body_axes(joints)
     middle = joints[..., (5, 6, 11, 12), :].mean(axis=-2)
@@ -87,12 +83,9 @@ def find_azimuths(cameras: Camera, joints: Floats) -> Floats:
 
 
 def learn_view_bias(residuals: Residuals, azimuth: Floats, scale: Floats) -> ViewBias:
-    """Return the bias by viewing direction, from linear least squares.
+    """Return the bias by viewing direction, by linear least squares of residuals of bodies.
 
-    Args:
-        residuals: residuals of bodies.
-        azimuth: (n,) [rad], of each row.
-        scale: (n,) [px/m].
+    Each row has an azimuth (n,) [rad] and a scale (n,) [px/m].
     """
     weight = residuals.weight * (np.isfinite(azimuth) & np.isfinite(scale))[:, None]
     waves = np.nan_to_num(_waves(azimuth) * scale[:, None])
@@ -118,12 +111,10 @@ error of careful calibration."""
 
 @dataclass(frozen=True, eq=False)
 class SystematicErrors:
-    """Systematic errors of a clip's detector and clocks.
+    """Systematic errors of a clip's detector, by viewing direction, and of its clocks.
 
-    Attributes:
-        view_bias: bias by viewing direction.
-        late: (cameras,) clock offset of each camera relative to the cameras' mean [frame]; positive
-            = the camera shows a later time.
+    `late` (cameras,) is the clock offset of each camera relative to the cameras' mean [frame];
+    positive = the camera shows a later time.
     """
 
     view_bias: ViewBias
@@ -145,12 +136,8 @@ class SystematicErrors:
     def clock_offsets_in(self, offsets: Floats, motion: BodyMotion) -> Floats:
         """Return the part of the clock offsets that people's offsets contain (cameras,) [frame].
 
-        People's offsets belong to joints triangulated without clock offsets, so a camera seems to
-        see people displaced along their motion.
-
-        Args:
-            offsets: (frames, cameras, persons, 2) [px], as of `TriangulatedDetections`.
-            motion: motion of the bodies.
+        People's offsets (frames, cameras, persons, 2) [px] belong to joints triangulated without
+        clock offsets, so a camera seems to see people displaced along their motion.
         """
         image_motion = np.nan_to_num(motion.image_motion.mean(axis=-2))
         along = (np.nan_to_num(offsets) * image_motion).sum(axis=(0, 2, 3))
@@ -169,12 +156,9 @@ class BodyMotion:
 
 
 def watch_motion(cameras: Camera, joints: Floats, step: Floats) -> BodyMotion:
-    """Return azimuth and image motion of bodies in all images.
+    """Return azimuth and image motion of bodies in all images of a batch (cameras,).
 
-    Args:
-        cameras: batch (cameras,).
-        joints: (frames, persons, 17, 3) [m], world.
-        step: (frames, persons, 17, 3) [m], their motion per frame.
+    Joints (frames, persons, 17, 3) [m], world, move by a step of that shape per frame.
     """
     ends = [
         cameras.project((joints + part * step).reshape(len(joints), 1, -1, 3))
@@ -269,11 +253,8 @@ class ClockEquations:
     ) -> ClockEquations:
         """Return the equations; they use the weights of `residuals`, not its values.
 
-        Args:
-            cameras: batch (cameras,).
-            joints: (frames, persons, 17, 3) [m], world, of bodies.
-            image_motion: (n, 17, 2) [px], of each row's joints per frame; NaN = unknown.
-            residuals: residuals of these joints; `frame` indexes the first axis of `joints`.
+        Joints (frames, persons, 17, 3) [m], world, of bodies move by `image_motion` (n, 17, 2) [px]
+        per frame, NaN = unknown. `frame` of the residuals indexes the first axis of `joints`.
         """
         persons, joint_count = joints.shape[1:3]
         count, width = cameras.batch_shape[0], 1 + STEP

@@ -56,19 +56,9 @@ def write_archive(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 def read_archive(
     path: Path, members: Mapping[str, Member], only: Collection[str] | None = None
 ) -> dict[str, NDArray[Any]]:
-    """Read the arrays of an npz file after validating their types, shapes and sizes.
+    """Read the float64, int64 and str arrays of an npz file; check types, shapes and sizes.
 
-    Args:
-        path: the file.
-        members: expected content; no other member is allowed.
-        only: requested members; None = all. The others are not loaded.
-
-    Returns:
-        float64, int64 and str arrays by name; optional members that are absent are left out.
-
-    Raises:
-        InputError: the file is absent, truncated, too large or no npz, or has members that are
-            missing, unknown, or of another type or shape; the error names file and member.
+    No members but these are allowed, and optional ones may be absent. `only` names those to load.
     """
     if not path.is_file():
         raise wrong(str(path), "an npz file", "nothing", "Check the path.")
@@ -90,15 +80,9 @@ def wrong(
 
 
 def read_npz(path: Path, limit: int) -> dict[str, NDArray[np.generic]]:
-    """Return all arrays of an npz file by name.
+    """Return all arrays of an npz file of `numpy.savez` or `savez_compressed` by name.
 
-    Args:
-        path: written by `numpy.savez` or `numpy.savez_compressed`.
-        limit: maximum unpacked size of all arrays together [byte].
-
-    Raises:
-        InputError: the file is no npz, truncated or too large, or has Python objects or
-            inconsistent sizes; the error names file and member.
+    InputError if they have more than `limit` bytes unpacked, Python objects or inconsistent sizes.
     """
     with open_npz(path) as file:
         infos = [info for info in file.infolist() if info.filename.endswith(".npy")]
@@ -109,11 +93,7 @@ def read_npz(path: Path, limit: int) -> dict[str, NDArray[np.generic]]:
 
 
 def open_npz(path: Path) -> zipfile.ZipFile:
-    """Return the archive.
-
-    Raises:
-        InputError: the file is no archive.
-    """
+    """Return the archive; InputError if the file is none."""
     try:
         return zipfile.ZipFile(path)
     # ValueError and NotImplementedError: a damaged directory, or one of a later version.
@@ -176,11 +156,7 @@ def _read_header(path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo) -> He
 def require_size(
     path: Path, infos: Collection[zipfile.ZipInfo], limit: int, ratio: int | None = None
 ) -> None:
-    """Raise InputError for arrays beyond `limit` bytes, and for excessive compression ratios.
-
-    Raises:
-        InputError: the arrays are too large, or compressed too much; the error names the file.
-    """
+    """Raise InputError for arrays beyond `limit` bytes, and for excessive compression ratios."""
     total = sum(info.file_size for info in infos)
     # The archive's directory may state more bytes than the file has.
     packed = min(sum(info.compress_size for info in infos), path.stat().st_size)
@@ -200,11 +176,7 @@ def require_size(
 def read_array(
     path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo, form: Member | None = None
 ) -> NDArray[Any]:
-    """Return a member's array, in the type of its form; check its header and size first.
-
-    Raises:
-        InputError: the bytes are damaged.
-    """
+    """Return a member's array, in the type of its form; check its header and size first."""
     read_as = {"float": np.float64, "int": np.int64, "text": np.str_}
     dtype = None if form is None else form.dtype or read_as[form.kind]
     try:

@@ -27,7 +27,7 @@ _Value = str | Sequence[str] | np.generic | NDArray[np.generic]
 def write_c3d(
     path: Path, tracks: JointTracks, person: int, fps: float, notes: Mapping[str, str]
 ) -> None:
-    """Write the joints of one person as a C3D file, whole or not at all.
+    """Write the joints of one person, an index in `tracks`, as a C3D file, whole or not at all.
 
     Points are the 17 joints, and heels and toes where the clip has them, in millimetres, x, y and z
     as in the world, z up, in single precision: 0.004 mm at 60 m. Frame 1 is the first frame of
@@ -35,17 +35,8 @@ def write_c3d(
     in time. The residual of a joint is its standard deviation, the mean over the axes, in whole
     millimetres from 1; it is 0, which the format reserves for computed points, if no camera
     contributes, and -1 if the joint is missing. Events mark the clip's begin and end, and group
-    WORLDPOSE holds the notes.
-
-    Args:
-        path: the file.
-        tracks: joints of several people.
-        person: index of the person in `tracks`.
-        fps: frames per second.
-        notes: texts for the group WORLDPOSE by parameter name; `name` is the subject's.
-
-    Raises:
-        InputError: the clip has no or too many frames, or a note is too long.
+    WORLDPOSE holds the notes, of which `name` is the subject's. InputError for a note that is too
+    long, and for no or too many frames.
     """
     # LONG_FRAMES is a number of single precision: 46 hours at 100 frames per second.
     max_frames = 1 << 24

@@ -37,11 +37,7 @@ ROTATION_TOLERANCE: Final = 1e-4
 
 
 class LeftOut(dict[str, str]):
-    """Reasons why cameras are left out, by camera.
-
-    Attributes:
-        notes: sentences about the others.
-    """
+    """Reasons why cameras are left out, by camera; `notes` are sentences about the others."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -68,16 +64,8 @@ def build_camera(
 ) -> CameraCalibration:
     """Return the camera record; a rounded matrix becomes the nearest rotation.
 
-    Args:
-        where: file and camera, for messages.
-        name: id of the camera.
-        optics: image size, camera matrix and lens.
-        rotation: (3, 3), R in x_cam = R x_world + t.
-        translation: t [m].
-
-    Raises:
-        InputError: the size is not whole, a focal length is not positive, the matrix is no
-            rotation, or the name is unfit for a file.
+    `where` is file and camera. x_cam = R x_world + t has R (3, 3) and t (3,) [m]. InputError for a
+    bad size, focal length or rotation, and for a name unfit for a file.
     """
     distance_limit = 1e7  # maximum coordinate of a translation [m]
     size_limit = 1 << 16  # of an image [px]; OpenCV's own for most operations
@@ -143,15 +131,7 @@ def known_id(name: str, known: Collection[str]) -> str:
 def index_by_name(
     path: Path, cameras: list[tuple[str, CameraCalibration]]
 ) -> dict[str, CameraCalibration]:
-    """Return the cameras by id, in file order.
-
-    Args:
-        path: the file, for messages.
-        cameras: pairs of place in the file and camera.
-
-    Raises:
-        InputError: there is no camera, two cameras have one name, or no camera has a pose.
-    """
+    """Return cameras by id, in file order; InputError for none, two of one name, or no pose."""
     by_name: dict[str, CameraCalibration] = {}
     for where, camera in cameras:
         if camera.id in by_name:
@@ -188,15 +168,9 @@ def read_calibration_toml(
 ) -> dict[str, CameraCalibration]:
     """Return the cameras of a TOML file by name, in file order.
 
-    Args:
-        path: the file.
-        left_out: receives cameras without a pose; None = all must have one.
-        sizes: width and height [px] of videos, for files whose size is no whole number: programs
-            that do not know it write twice the principal point.
-
-    Raises:
-        InputError: an entry is missing or invalid, the unit is another, or the world
-            of FreeMoCap's file is not that of the ground; it names file and key.
+    `left_out` receives cameras without a pose; None = all must have one. `sizes`, width and height
+    [px] of videos, serve files whose size is no whole number: programs that do not know it write
+    twice the principal point. InputError also if the world of FreeMoCap is not that of the ground.
     """
     content = read_toml(path)
     unit_m = toml_unit_m(path, content)
@@ -316,8 +290,7 @@ def tells_model(key: str) -> bool:
 def read_model(where: str, given: Mapping[str, Any]) -> tuple[bool, bool]:
     """Return whether a lens's entries say, under any usual name, a fisheye, or a word of one order.
 
-    Raises:
-        InputError: one names another lens model than those of OpenCV, or two contradict.
+    InputError if one names another lens model than those of OpenCV, or two contradict.
     """
     # Names of lens models, and parts of them, which names of devices do not have.
     lens_part = r"fish|omnidir|equidist|equisolid|kannala|(?<!a)spher|division|polynom|radial"
@@ -381,19 +354,10 @@ def read_camera_table(
     axes: NDArray[np.float64] | None = None,
     where_pose: str | None = None,
 ) -> CameraCalibration:
-    """Return the camera of a table.
+    """Return the camera `name` of a table with the form's `keys` and translations in `unit_m` [m].
 
-    Args:
-        where: file and camera, for messages.
-        name: id of the camera.
-        table: entries by key, as numbers and lists of them.
-        keys: the form's names of the entries.
-        unit_m: unit of the translation [m].
-        axes: (3, 3) rotation A from the world of the file to one with z up, x' = A x; None = none.
-        where_pose: as `where`, for the pose, if it is in another file.
-
-    Raises:
-        InputError: an entry is missing, misshapen, infinite or impossible.
+    `where`, and `where_pose` if that is in another file, are file and camera for messages; `axes`
+    (3, 3) is the rotation A from the world of the file to one with z up, x' = A x; None = none.
     """
     optics = read_optics(where, table, keys)
     where_pose = where if where_pose is None else where_pose

@@ -99,17 +99,11 @@ def read_calibration(
     *,
     any_unit: bool = False,
 ) -> dict[str, CameraCalibration]:
-    """Return the cameras of a calibration by name, in file order.
+    """Return the cameras of a file of one of `FORMS`, or of a folder that has one, in file order.
 
-    Args:
-        path: a file of one of `FORMS`, or a folder that has one calibration.
-        sizes: image sizes that the file may lack, such as those of the videos.
-        left_out: receives cameras without a pose, with the reason; None = all must have one.
-        any_unit: whether cameras may be as far apart as in another unit than the form's.
-
-    Raises:
-        InputError: an unknown form, a folder with no calibration or several, or an invalid entry,
-            with file and key.
+    `sizes` are image sizes that the file may lack, such as those of the videos; `left_out` receives
+    cameras without a pose, with the reason; None = all must have one. With `any_unit`, cameras may
+    be as far apart as in another unit than the form's.
     """
     form, files = find_calibration(path) if path.is_dir() else _form_of(path)
     cameras = form.read(files, sizes, left_out)

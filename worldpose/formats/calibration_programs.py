@@ -190,13 +190,7 @@ def read_openpose_cameras(
     """Return the cameras of OpenPose's files `<camera>.xml`, in the world of the first one [m].
 
     `CameraMatrix` (3, 4) is [R | t], `Intrinsics` (3, 3), `Distortion` has OpenCV's coefficients.
-
-    Args:
-        files: one for each camera.
-        sizes: width and height [px] of each camera's images, which the files lack.
-
-    Raises:
-        InputError: an entry is missing or invalid, or the size is not known.
+    `sizes` are width and height [px] of each camera's images, which the files lack.
     """
     cameras = []
     for file in files:

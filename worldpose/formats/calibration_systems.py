@@ -40,16 +40,8 @@ def read_calibration_xml(
     """Return the cameras of a calibration of Qualisys, Vicon or OptiTrack, in file order.
 
     The root element tells the system: `calibration`, `Cameras` or `calibrationProfile`. Parameters
-    that Qualisys' server states (`QTM_Parameters_Ver_...`) contain the first.
-
-    Args:
-        path: the file.
-        left_out: receives cameras that are not calibrated; None = all must be.
-
-    Raises:
-        InputError: the file is unreadable, of another program, or has a missing attribute, no
-            finite number, no rotation, a lens that OpenCV's model does not describe, no camera, or
-            two cameras of one name; the error names file, camera and attribute.
+    that Qualisys' server states (`QTM_Parameters_Ver_...`) contain the first. `left_out` receives
+    cameras that are not calibrated; None = all must be.
     """
     require_file(path, 16 * SETTINGS_BYTES)
     try:
@@ -155,11 +147,10 @@ def _read_qualisys_camera(where: str, element: ET.Element) -> CameraCalibration:
 
     `<intrinsic>`: focal length and centre point are in 1/64 px of the sensor, or in px where the
     sensor (`sensorMaxU`) is; `<fov_video>` (px, both ends included) is the part of the sensor in
-    the video, the whole one in files without it. The radial and tangential (in the
-    file: tangental) coefficients act on the normalised image plane and have no unit, so that they
-    need no conversion: only lengths on the sensor are in 1/64 px. (Pose2Sim's reader divides them
-    by 64 as well, which nearly removes the distortion.) `viewrotation` rotates only the view in
-    QTM; the function ignores it.
+    the video, the whole one in files without it. The radial and tangential (in the file: tangental)
+    coefficients act on the normalised image plane and have no unit. (Pose2Sim's reader divides them
+    by 64, which nearly removes the distortion.) `viewrotation` rotates only the view in QTM; the
+    function ignores it.
     """
     parts = {tag: _child(where, element, tag) for tag in ("transform", "intrinsic")}
     fov = element.find("fov_video")
@@ -287,12 +278,8 @@ def _vicon_optics(
     Vicon's model goes from the pixel in the image to that without distortion: the offset d from the
     center of distortion is scaled by 1 + w1 d^2 + w2 d^4 + w3 d^6 [px]. `VICON_RADIAL2` is
     "Vicon3Parameter" with that center and w1, w2, w3; `VICON_RADIAL` is w1, w2, about the principal
-    point. OpenCV's model goes the other way, on the plane at distance 1. (Pose2Sim's reader takes
-    w1 and w2 as k1 and k2, which removes the distortion.)
-
-    Raises:
-        InputError: another model, one that folds the image, or one that OpenCV's coefficients do
-            not follow within `LENS_ERROR_PX`.
+    point. OpenCV's model goes the other way, on the plane at distance 1. InputError for a model
+    that folds the image, or that OpenCV's coefficients do not follow within `LENS_ERROR_PX`.
     """
     text = frame.get("VICON_RADIAL2")
     if text is not None:

@@ -67,16 +67,10 @@ def read_camera_data(
 ) -> CameraData:
     """Return the camera data of a file.
 
-    Args:
-        path: FreeD packets one after another, or in a capture (pcap), or a table (CSV, TSV).
-        fps: images per second of the video, for time codes and the times of captures.
-        size: width and height of the image [px], for fields of view.
-        first: number in the video of the first row; None = the table's number, else 0.
-        number: FreeD's number of the camera; -1 = there is only one.
-
-    Raises:
-        InputError: another form, a wrong checksum, a missing or unknown column, no number, frames
-            that do not rise, or a value out of bounds; the error names packet or row.
+    It has FreeD packets one after another, or in a capture (pcap), or a table (CSV, TSV). `fps`
+    [1/s] of the video serves time codes and captures, `size`, width and height [px], fields of
+    view. `first` is the number in the video of the first row; None = the table's number, else 0.
+    `number` is FreeD's of the camera; -1 = there is only one.
     """
     content = b""
     if path.is_file() and path.stat().st_size <= _BYTES:
@@ -292,8 +286,7 @@ def _is_fine(time: Floats) -> bool:
 def _time_frames(path: Path, columns: dict[str, Floats], fps: float) -> tuple[Integers, str]:
     """Return the rows that count by the time of a table, with `frame` of them; and a sentence.
 
-    Raises:
-        InputError: times do not rise, are in no seconds, or contradict the frames.
+    InputError if times do not rise, are in no seconds, or contradict the frames.
     """
     time, are_seconds = columns["time"], _is_fine(columns["time"])
     if "frame" in columns:
@@ -379,13 +372,8 @@ def _focal_lengths(path: Path, columns: Mapping[str, Floats], size: tuple[int, i
 def apply_zoom_table(data: CameraData, path: Path, size: tuple[int, int]) -> CameraData:
     """Return camera data with the focal lengths of their zoom counts, linear between the rows.
 
-    Args:
-        data: camera data with zoom counts.
-        path: a table of the lens: the column zoom, and one of the focal length or field of view.
-        size: width and height of the image [px].
-
-    Raises:
-        InputError: the table is invalid, or its focal length does not only rise or only fall.
+    The table of the lens has the column zoom, and one of the focal length or field of view, which
+    only rises or only falls. `size` is width and height of the image [px].
     """
     columns, _, _ = _read_columns(path, ("zoom",))
     order = np.argsort(columns["zoom"])

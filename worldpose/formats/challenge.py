@@ -56,12 +56,7 @@ def challenge_truth(model: BodyModel, poses: BodyParameters, camera: Camera) -> 
     A box contains the part of a body inside the image; a person outside the image has neither box
     nor skeleton in that frame. Skeletons are BODY25 and extend beyond the image border. `skel_3d`
     is the ideal result of a single-view estimator: the skeleton in the camera's axes, with the
-    mid-hip as origin.
-
-    Args:
-        model: body model of the parameters.
-        poses: (persons, frames).
-        camera: (frames,); NaN where a frame has no camera.
+    mid-hip as origin. Poses are (persons, frames); the camera (frames,) is NaN where there is none.
     """
     persons, frames = poses.batch_shape
     points = fold_keypoints(model, BODY25)
@@ -119,16 +114,11 @@ KINDS: Final = {"boxes": (4,), "skel_2d": ("points", 2), "skel_3d": ("points", 3
 
 
 def write_challenge_camera(path: Path, camera: Camera, edition: Edition) -> float:
-    """Write cameras/<clip>.npz: every frame's K and k, and R and t of the first frame alone.
+    """Write cameras/<clip>.npz; return the greatest error of the lens in the image [px].
 
-    The kit's lenses have k1 and k2 alone: with others, those are the best over the image's pixels.
-    The edition of 2025 repeats R and t as Rt.
-
-    Returns:
-        Greatest error of the lens in the image [px].
-
-    Raises:
-        InputError: the first frame has no camera.
+    It has every frame's K and k, and R and t of the first frame alone; InputError if that has no
+    camera. The kit's lenses have k1 and k2 alone: with others, those are the best over the image's
+    pixels. The edition of 2025 repeats R and t as Rt.
     """
     if np.isnan(camera.numbers[0]).any():
         raise wrong(
@@ -211,11 +201,8 @@ def fill_submission(joints: Floats, places: Floats) -> tuple[Floats, int]:
     """Return joints (persons, frames, 15, 3) [m] without gaps, and the number of poses added.
 
     A challenge scores every box, also where no body could be fitted. Such a frame takes the
-    person's body of the nearest frame, or else the mean of all bodies, at the person's place.
-
-    Args:
-        joints: (persons, frames, 15, 3) [m], world; NaN without a body.
-        places: (persons, frames, 2) [m], world, below the mid-hip; NaN where unknown.
+    person's body of the nearest frame, or else the mean of all bodies, at the person's place
+    (persons, frames, 2) [m], below the mid-hip; NaN where unknown.
     """
     hips = [CHALLENGE15.index(name) for name in ("right_hip", "left_hip")]
     root = joints[..., hips, :2].mean(axis=-2)
@@ -250,16 +237,7 @@ def write_pitch_points(path: Path, points: Floats) -> None:
 
 
 def read_challenge(folder: Path, only: str | None = None) -> dict[str, ChallengeClip]:
-    """Read the clips of a challenge folder of either edition, by name.
-
-    Args:
-        folder: the folder.
-        only: the requested clip, if it is there; None = all. No other is loaded.
-
-    Raises:
-        InputError: the file is absent, has wrong types or shapes, or kinds that disagree; the error
-            names file and place.
-    """
+    """Read the clips of a challenge folder of either edition, by name, or the `only` one wanted."""
     kinds: dict[str, dict[str, Floats]] = {}
     for kind in KINDS:
         together = folder / f"{kind}.npz"
@@ -315,14 +293,8 @@ def read_submission(path: Path, only: Collection[str] | None = None) -> dict[str
     """Read the joints (persons, frames, 15, 3) [m, world] of a submission by clip.
 
     It is an npz, zipped or bare, or a table as of 2025, with a row for each joint of sequence,
-    frame, person, joint, x, y, z. A table's last persons and frames are those with a joint.
-
-    Args:
-        path: the file.
-        only: requested clips; None = all. The others are not loaded.
-
-    Raises:
-        InputError: there is no such file, no submission in it, or arrays of another type or shape.
+    frame, person, joint, x, y, z. A table's last persons and frames are those with a joint. Of the
+    clips, `only` names those to load.
     """
     if path.suffix.lower() == PARQUET:
         return _read_table(path, only)

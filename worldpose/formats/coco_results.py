@@ -55,12 +55,8 @@ _NUMBER_TODO: Final = (
 def read_coco_results(path: Path) -> PeopleFile:
     """Return the people of a results file by rising frame, without frames that have no people.
 
-    The function reads in batches: the arrays bound the memory, not Python objects.
-
-    Raises:
-        InputError: the file is unreadable, or has points of an unknown set, a confidence of another
-            scale, no frame number, or too many people per frame; the error names file, result and
-            point.
+    The function reads in batches: the arrays bound the memory, not Python objects. InputError also
+    for an unknown set of points, a confidence of another scale, and too many people per frame.
     """
     json_bytes = 1 << 30  # two million people; npz holds more and is faster
     keep = ("images", "meta_info")
@@ -170,10 +166,7 @@ def _batches(path: Path, items: Iterable[Any]) -> Iterator[tuple[int, list[dict[
 
 
 def _read_batch(path: Path, results: list[dict[str, Any]], first: int, *, is_set: bool) -> _Results:
-    """Return results; null or an empty list in place of points is none of them.
-
-    So is no list at all, in a data set or beside a box.
-    """
+    """Return results; null, no or an empty list in place of points is none, with a set or a box."""
     max_points = 1000  # maximum points of a person
     images = _images(path, results, first)
     lacks = np.array(
@@ -282,10 +275,7 @@ class _Categories(NamedTuple):
 
 
 def _categories(path: Path, limit: int) -> _Categories:
-    """Return the categories of a data set; empty without names of points.
-
-    It reads the file once more: a data set has its categories after the annotations.
-    """
+    """Return the categories of a data set, after its annotations; empty without points' names."""
     items = JsonItems(path, "categories", limit)
     given = [each for each in takewhile(lambda _: items.is_mapping, items) if type(each) is dict]
     lists = [each.get("keypoints") for each in given]

@@ -34,17 +34,10 @@ from worldpose.video.names import frame_numbers
 
 
 def read_openpose_folder(folder: Path, model: str | None = None) -> PeopleFile:
-    """Return the people of one camera; `worldpose.formats.keypoint_sets` tells their points.
+    """Return the people of one camera's folder with a JSON file of OpenPose for each frame.
 
-    `frame_numbers` finds the frame in a file's name. An empty file is a frame without people.
-
-    Args:
-        folder: holds a JSON file for each frame.
-        model: Pose2Sim's name of the pose model, if it is known.
-
-    Raises:
-        InputError: there are no frames, two files for the same frame, no JSON of OpenPose, or an
-            unknown or a changing number of keypoints; the error names file and key.
+    `frame_numbers` finds the frame in a file's name, `worldpose.formats.keypoint_sets` the points,
+    of which `model` is Pose2Sim's name, if it is known. An empty file is a frame without people.
     """
     files = frame_files(folder)
     whole = {frame: _read_frame(files[frame]) for frame in sorted(files)}
@@ -165,20 +158,11 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
 
     A line is frame, id, left, top, width, height, and up to four more numbers: confidence (-1 is
     taken as 1, and a box of confidence 0 is not counted, as in MOTChallenge's truth) and the class,
-    of which 1 is a person and -1 is not known; of 8 or 10 numbers, 0 is one if no box has these.
-    Of 10 numbers it may be VisDrone's, which has persons of class 1 and 2, or a place in the world.
+    of which 1 is a person and -1 is not known; of 8 or 10 numbers, 0 is one if no box has these. Of
+    10 numbers it may be VisDrone's, which has persons of class 1 and 2, or a place in the world.
     Frames begin at 1, and (1, 1) is the upper left corner of the image. Trackers follow people out
-    of the image: such boxes are left out.
-
-    Args:
-        file: the text.
-        size: width and height of the video [px].
-        frames: number of frames of the video.
-
-    Raises:
-        InputError: the file is unreadable or empty, a line has no such numbers, a frame that the
-            video lacks, an id twice in a frame, an empty box, an impossible confidence, or most
-            boxes are outside of the image; the error names the line.
+    of the image, whose width and height are `size` [px]: such boxes are left out. InputError for a
+    frame beyond `frames`, an id twice in a frame, or most boxes outside of the image.
     """
     if file.suffix.lower() == ".npy":
         return _read_identified(file, frames)

@@ -92,13 +92,7 @@ XML, of which annotations and calibrations have five."""
 
 
 def read_yaml(path: Path) -> Any:  # noqa: ANN401
-    """Return the only document of a YAML file, as plain values, without aliases or repeated keys.
-
-    Dates stay text, so that `match_id: 2024-05-01` is a name.
-
-    Raises:
-        InputError: no such file, too large, not YAML, nested too deep, an alias or a repeated key.
-    """
+    """Return the only document of a YAML file, dates as text, without aliases or repeated keys."""
     return parse_yaml(str(path), read_text(path, SETTINGS_BYTES))
 
 
@@ -271,17 +265,9 @@ class JsonItems:
     def __init__(
         self, path: Path, key: str, limit: int, keep: Collection[str] = (), other_key: str = ""
     ) -> None:
-        """Prepare reading.
+        """Prepare reading a file of at most `limit` bytes.
 
-        Args:
-            path: the file.
-            key: key of the list if the file is a mapping.
-            limit: maximum size of the file [byte].
-            keep: further keys of the mapping whose values are kept.
-            other_key: another name of the key.
-
-        Raises:
-            InputError: no such file, or too large.
+        In a mapping, `key` or `other_key` has the list, and the values of the keys `keep` are kept.
         """
         require_file(path, limit)
         self.path, self.keys = path, (key, other_key)

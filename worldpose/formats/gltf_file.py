@@ -78,10 +78,7 @@ def known_frames(camera: Camera) -> tuple[NDArray[np.int64], Camera]:
 
 
 def lens_notes(known: Camera) -> tuple[str, str, Floats]:
-    """Return lens model, key that names its coefficients, and these (frames, n) of a camera.
-
-    There is one row if the lens is the same in all frames (frames,) of the camera.
-    """
+    """Return a camera's lens model, the key of its coefficients, and these (frames or 1, n)."""
     model = LensModel(int(known[0].lens_model))
     key, values = "_".join(["distortion", *COEFFICIENTS[model.label]]), known.distortion
     values = values[:, model.columns]
@@ -117,10 +114,8 @@ class _File:
     ) -> int:
         """Append an array (rows, ...); return the index of its accessor.
 
-        Args:
-            array: (rows, ...) of int16 (fractions), uint8, uint16, uint32 or float32.
-            target: use of the data, for vertices and indices.
-            bounds: state the extreme values.
+        Types are int16 (fractions), uint8, uint16, uint32 and float32; `target` is the use of
+        vertices and indices, and `bounds` states the extreme values.
         """
         self.blob += b"\0" * (-len(self.blob) % 4)
         view = {"buffer": 0, "byteOffset": len(self.blob), "byteLength": array.nbytes}
@@ -152,7 +147,7 @@ def write_gltf(
     notes: Mapping[str, str],
     surface: bool = True,
 ) -> None:
-    """Write a clip as one .glb file, whole or not at all.
+    """Write a clip as one .glb file, whole or not at all; InputError if no person has a body.
 
     Node `world` turns glTF's axes (y up) into the world's (z up), and all others are below it:
     `pitch`, each camera and each person, in metres. A person's 24 joints form a hierarchy; the
@@ -161,22 +156,13 @@ def write_gltf(
     each joint's compensates for the rounding of its parents, so that errors do not add up. The
     surface has the person's shape and the model's skinning weights, without pose correctives.
 
-    Cameras have the focal length and pose, and their `extras` the rest: image size, principal
-    point and distortion, and of a moving camera the focal length of every frame, and the
-    distortion where it changes, since glTF cannot animate them.
+    Cameras have the focal length and pose, and their `extras` the rest: image size, principal point
+    and distortion, and of a moving camera the focal length of every frame, and the distortion where
+    it changes, since glTF cannot animate them.
 
-    Args:
-        path: the file.
-        model: body model of the poses.
-        people: bodies over the same frames.
-        fps: frames per second; frame 0 is at 0 s.
-        cameras: cameras by name, single or one per frame, with NaN where unknown.
-        markings: lines on the pitch (points, 3) [m], world.
-        notes: texts for the file's `extras`; `licence` is its copyright.
-        surface: write the surface of bodies, not only their joints.
-
-    Raises:
-        InputError: no person has a body.
+    People have the same frames, of which 0 is at 0 s. Cameras are single or one per frame, NaN
+    where unknown; markings are lines (points, 3) [m], world. `notes` become the file's `extras`,
+    and `licence` its copyright.
     """
     file = _File()
     writer = _Writer(file, model, fps, surface=surface)
@@ -407,10 +393,7 @@ class _Writer:
 
 
 def paint_strips(markings: Sequence[Floats]) -> tuple[Floats, Integers]:
-    """Return flat strips along lines: vertices (n, 3) [m] and triangles (m, 3), which face up.
-
-    Lines (points, 3) [m], world, have two points or more.
-    """
+    """Return strips that face up along lines (points, 3) [m]: vertices (n, 3), triangles (m, 3)."""
     marking_width_m = 0.12  # at most by the Laws; programs render no line without width
     vertices, triangles, first = [], [], 0
     for line in markings:
@@ -429,14 +412,10 @@ def paint_strips(markings: Sequence[Floats]) -> tuple[Floats, Integers]:
 
 
 def _quantize_rotations(rotations: Floats, parents: NDArray[np.int64]) -> NDArray[np.int16]:
-    """Return quaternions x y z w (frames, joints, 4) relative to the parents, in 16 bits.
+    """Return quaternions x y z w (frames, joints, 4) relative to the parents (joints,), in 16 bits.
 
-    A joint's rotation relative to the world is rounded once only: the next one is relative to what
-    its parent became by rounding.
-
-    Args:
-        rotations: (frames, joints, 3, 3), relative to the world.
-        parents: (joints,).
+    A joint's rotation (frames, joints, 3, 3) relative to the world is rounded once only: the next
+    one is relative to what its parent became by rounding.
     """
     rounded = np.empty((*rotations.shape[:2], 4), np.int16)
     became = np.empty_like(rotations)

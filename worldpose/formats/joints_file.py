@@ -303,14 +303,10 @@ def write_poses(path: Path, poses: BodyParameters, body_model: str) -> None:
     """Write `poses/<clip>.npz`, whole or not at all; equal poses give equal bytes.
 
     Members in single precision, with an error of at most 4 um on a pitch of 105 m: `betas`
-    (persons, shapes), `global_orient` (persons, frames, 3) [rad], `body_pose` (persons, frames, 69)
-    [rad], `transl` (persons, frames, 3) [m, world]. NaN where a person is missing. The release has
-    one body model; here `body_model` (1,) names it, since betas of another are meaningless.
-
-    Args:
-        path: the file.
-        poses: (persons, frames); each person's betas are those of the first frame.
-        body_model: name and version of the body model.
+    (persons, shapes) of the first frame, `global_orient` (persons, frames, 3) [rad], `body_pose`
+    (persons, frames, 69) [rad], `transl` (persons, frames, 3) [m, world]. NaN where a person is
+    missing. The release has one body model; here `body_model` (1,) is its name and version, since
+    betas of another are meaningless.
     """
     arrays: Mapping[str, NDArray[np.float64]] = {
         "betas": poses.betas[:, 0],
@@ -323,15 +319,7 @@ def write_poses(path: Path, poses: BodyParameters, body_model: str) -> None:
 
 
 def read_poses(path: Path) -> tuple[BodyParameters, str | None]:
-    """Read the poses (persons, frames) of a pose file, with singular or plural names.
-
-    Returns:
-        The poses, and the name of their body model if the file has it.
-
-    Raises:
-        InputError: the file is absent or truncated, or has missing or unknown members or wrong
-            shapes; the error names file and member.
-    """
+    """Read the poses (persons, frames) of a file and the name of their body model, or None."""
     errors: list[InputError] = []
     for renamed in ({}, PLURALS):
         back = {name: plural for plural, name in renamed.items()}

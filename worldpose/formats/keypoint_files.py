@@ -68,15 +68,7 @@ def write_keypoint_arrays(path: Path, people: KeypointDetections) -> None:
 
 
 def read_keypoint_arrays(path: Path) -> KeypointDetections:
-    """Return the people of an npz file as stored; frames rise, possibly with gaps.
-
-    The function checks every declared type, shape and size before it unpacks data.
-
-    Raises:
-        InputError: the file is truncated, too large or no npz, has another type, shape or byte
-            order, frames that do not rise, infinite values, or a keypoint without confidence; the
-            error names file and member.
-    """
+    """Return the people of an npz file as stored; frames rise, possibly with gaps."""
     points_limit = 1000  # maximum number of these points
     require_file(path)
     extra_members = ("point", "extra_keypoints", "extra_confidence")  # all or none
@@ -166,12 +158,8 @@ def _either(pairs: Flags) -> Flags:
 def read_people(path: Path) -> PeopleFile:
     """Return the people of one camera, and what was changed to read them.
 
-    Args:
-        path: `.json` (`read_coco_results`), `.npz` (`read_keypoint_arrays`), or a folder with a
-            JSON file of OpenPose for each frame (`read_openpose_folder`).
-
-    Raises:
-        InputError: the file is unreadable or invalid; the error names file and place.
+    The file is `.json` (`read_coco_results`), `.npz` (`read_keypoint_arrays`), or a folder with a
+    JSON file of OpenPose for each frame (`read_openpose_folder`).
     """
     if path.is_dir():
         return read_openpose_folder(path)
@@ -202,15 +190,9 @@ def select_ranges(
 ) -> KeypointDetections:
     """Return the people of `path`, dense over ranges of the camera's own frames.
 
-    Frames outside are left out; frames that the file lacks have no people.
-
-    Args:
-        path: the file, for messages.
-        people: its people.
-        ranges: first frame and number of frames of each range, rising and disjoint.
-
-    Raises:
-        InputError: all people are outside the wanted frames, or these are too many.
+    A range is first frame and number of frames; ranges rise and are disjoint. Frames outside are
+    left out; frames that the file lacks have no people. InputError if nobody is left, or too many
+    are.
     """
     seen = people.frame
     if len(seen) and not any(((seen >= first) & (seen < first + n)).any() for first, n in ranges):

@@ -123,13 +123,7 @@ the simulation miss by 0.03 to 0.15, wrong ones by 0.5 or more."""
 
 
 def order_by_names(where: str, names: Sequence[str]) -> PointOrder:
-    """Return the order of points whose names a file gives, in any usual spelling.
-
-    A set may lack joints of the face.
-
-    Raises:
-        InputError: another joint of COCO-17 is missing, or two names are the same.
-    """
+    """Return the order of points by names in any spelling; only face joints may be missing."""
     plain = [_plain(str(name)) for name in names]
     if "left_ankle" not in plain:  # Human3.6M calls them feet
         plain = [re.sub(r"^(left|right)_foot$", r"\1_ankle", name) for name in plain]
@@ -165,16 +159,10 @@ def _plain(name: str) -> str:
 
 
 def order_by_points(where: str, points: AnyFloats, stated: str | None = None) -> PointOrder:
-    """Return the order of points whose number alone is known, and perhaps a model.
+    """Return the order of points (people, points, 3) x, y [px] and confidence, 0 = missing.
 
-    Args:
-        where: file, for messages.
-        points: (people, points, 3) x, y [px] and confidence; 0 = missing.
-        stated: name in `MODELS`, which counts if it has this number of points.
-
-    Raises:
-        InputError: no set has this number of points, or their lengths are those of another set or
-            of none.
+    Their number alone is known, and perhaps a name in `MODELS`, which counts if it has this number.
+    InputError if no set has it, or the lengths are those of another set or of none.
     """
     plausible = 0.3  # largest misfit of the order that explains them [log]
     # Least misfit of people, as many as these, that no view explains [log]: seen from right above,
@@ -268,11 +256,8 @@ def unknown_size(where: str, size: int) -> InputError:
 def _misfit(points: AnyFloats, pairs: NDArray[np.int64], lengths: Floats, least: int = 8) -> float:
     """Return the mean deviation of people's lengths [log] from the usual ones; NaN if unknown.
 
-    Args:
-        points: (people, points, 3).
-        pairs: (bones, 2, 2) places of the ends of the left and right bone.
-        lengths: (bones,) usual lengths, of which only ratios count.
-        least: fewest bones that have to be known; with 8 of 10 the face may be hidden.
+    Points are (people, points, 3), pairs (bones, 2, 2) the places of the ends of the left and right
+    bone. Only ratios of the usual lengths (bones,) count, and with 8 of 10 the face may be hidden.
     """
     sample = 2000  # people whose lengths are compared; more add nothing
     some = points[:: max(1, len(points) // sample)]
@@ -337,16 +322,10 @@ def people_by_frame(
 ) -> tuple[KeypointDetections, int]:
     """Return people by rising frame, and the number of entries that are nobody.
 
-    Args:
-        path: the file, for messages.
-        frames: (n,) frame of each entry.
-        points: (n, 17 or 23, 3) COCO-17 and perhaps `FEET`; confidence 0 = missing.
-        boxes: (n, 4) x, y, width, height [px]; NaN or None = that of the joints.
-        scores: (n,) NaN or None = the mean confidence of the joints.
-        limit: maximum size of the arrays [byte].
-
-    Raises:
-        InputError: too many people in a frame, or arrays that are too large.
+    An entry has a frame (n,), points (n, 17 or 23, 3) of COCO-17 and perhaps `FEET`, with
+    confidence 0 = missing. Boxes (n, 4) are x, y, width, height [px], or else those of the joints;
+    scores (n,) are the joints' mean where NaN or None. InputError beyond `limit` bytes or people of
+    a frame.
     """
     found: Flags = np.asarray(points[..., 2] > 0)
     if found.sum() >= len(COCO17) and float(np.abs(points[found, :2]).max()) < 2.0:

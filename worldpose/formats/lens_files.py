@@ -65,18 +65,11 @@ def read_lenses(
 ) -> dict[str, LensCalibration]:
     """Return lenses by camera.
 
-    Args:
-        files: one TOML file with a table for each camera; or, for one camera, an OpenCV XML, YAML
-            or JSON file, TOML without tables, an npz file, or two npy files, one of them the 3 x 3
-            matrix. Kalibr's YAML, and JSON of multical and Panoptic Studio, name their cameras too.
-        camera: the camera of a file that names none; None = a TOML file with names.
-        sizes: width and height of each camera's images [px]. A lens of a file with another size
-            and the same shape of image is scaled.
-
-    Raises:
-        InputError: a file is unreadable, of another kind, without matrix or distortion; the pixels
-            are not square; the lens folds within the image; the image sizes do not fit; a camera is
-            unknown or not named.
+    Files are one TOML file with a table for each camera; or, for one `camera`, an OpenCV XML, YAML
+    or JSON file, TOML without tables, an npz file, or two npy files, one of them the 3 x 3 matrix.
+    Kalibr's YAML, and JSON of multical and Panoptic Studio, name their cameras too. A lens of
+    another size than `sizes`, width and height [px], and the same shape of image is scaled.
+    InputError also if pixels are not square, or the lens folds within the image.
     """
     first = files[0]
     camera = None if camera is None else known_id(camera, sizes)
@@ -126,16 +119,7 @@ def read_lenses(
 def read_lens_toml(
     file: Path, sizes: Mapping[str, tuple[int, int]], camera: str | None = None
 ) -> dict[str, LensCalibration]:
-    """Return the lenses of a TOML file by camera; `rotation` and `translation` are ignored.
-
-    Args:
-        file: a table for each camera.
-        sizes: as in `read_lenses`; the file may have further cameras.
-        camera: the only camera to read; None = all.
-
-    Raises:
-        InputError: as in `read_lenses`.
-    """
+    """Return a TOML file's lenses by camera, or one, without poses; see `read_lenses`."""
     return _lenses(file, camera_tables(file), sizes, camera)
 
 
@@ -226,9 +210,6 @@ def read_opencap(file: Path) -> dict[str, Any]:
     """Return the entries of OpenCap's pickle of one camera, of which nothing is run.
 
     Its image size has the height first; here the width is first.
-
-    Raises:
-        InputError: the file is none.
     """
     from worldpose.pickles import read_pickle  # late: it imports scipy
 
@@ -290,9 +271,7 @@ def kalibr_tables(
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the name of each camera of a camchain, and its table in Anipose's form, perhaps posed.
 
-    Raises:
-        InputError: the content is no camchain, or a camera has another model than the pinhole with
-            `radtan`, `equidistant` or no distortion.
+    InputError for another model than the pinhole with `radtan`, `equidistant` or no distortion.
     """
     if not isinstance(content, dict) or not is_kalibr(content):
         expected = "a camchain of Kalibr, or EasyMocap's intri.yml and extri.yml"
@@ -347,13 +326,7 @@ def _chain(
 
 
 def _read_mapping(file: Path) -> dict[str, Any]:
-    """Return numbers, arrays and texts of plain JSON, YAML or TOML, as of ROS's camera_calibration.
-
-    A matrix is a list of rows, or a mapping with `rows`, `cols` and `data`.
-
-    Raises:
-        InputError: the file is no mapping, or a matrix has other sizes than it says.
-    """
+    """Return plain JSON, YAML or TOML; matrices are rows, or ROS's `rows`, `cols` and `data`."""
     suffix = file.suffix.lower()
     content: Any = read_toml(file) if suffix == ".toml" else None
     if content is None:
@@ -400,10 +373,7 @@ def _pick(where: str, given: Mapping[str, Any], names: Sequence[str], what: str)
 
 
 def _image_size(given: Mapping[str, Any]) -> tuple[int, int] | None:
-    """Return the image size in a file, as two numbers, `width` and `height`, or "1920x1080".
-
-    Other entries of such names, as of a board or of numpy's shape, are none.
-    """
+    """Return the image size in a file, as two numbers, `width` and `height`, or "1920x1080"."""
     number = r"(\d+\.?\d*(?:e[-+]?\d+)?)"
     for names in SIZE_NAMES:
         value = [given[key] for key in (_key(given, [name]) for name in names) if key]

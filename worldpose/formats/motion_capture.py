@@ -123,16 +123,10 @@ def alphapose_results(
 ) -> list[dict[str, Any]]:
     """Return people in the images of a camera as results of AlphaPose in 26 points of Halpe.
 
-    Tools that lift 2D poses, such as MotionBERT, read this list: one entry per person and image,
-    by image, with the person as `idx`. A point has confidence 1 if nothing hides it, 0.5 if a
-    nearer person does, and 0 outside the image.
-
-    Args:
-        pixels: (frames, persons, 26, 2) [px]; NaN where missing.
-        hidden: (frames, persons, 26), by a nearer person.
-        person_ids: (persons,).
-        camera: as in `coco_dataset`.
-        number: (frames,) the camera's own frame, as in `coco_dataset`.
+    Tools that lift 2D poses, such as MotionBERT, read this list: one entry per person and image, by
+    image, with the person as `idx`. A point, (frames, persons, 26, 2) [px] or NaN, has confidence 1
+    if nothing hides it, 0.5 if `hidden` (frames, persons, 26) by a nearer person, and 0 outside the
+    image. Camera and number are as in `coco_dataset`.
     """
     size = camera.image_size.reshape(-1, 2)[0]
     within = np.all((pixels >= -0.5) & (pixels <= size - 0.5), axis=-1)
@@ -182,18 +176,12 @@ Y_UP: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 def write_markers(path: Path, tracks: JointTracks, person: int, fps: float) -> None:
-    """Write the joints of one person as a TRC file, whole or not at all.
+    """Write the joints of one person, an index in `tracks`, as a TRC file, whole or not at all.
 
-    Markers are the 17 joints, and heels and toes where the clip has them.
-    Rows cover every frame from the person's first to last joint; a missing joint has empty cells.
-    `Frame#` is the match frame plus one, as such files count from one, and `Time` is that of the
-    match frame [s]. Coordinates are y up, in millimetres.
-
-    Args:
-        path: the file.
-        tracks: joints of several people.
-        person: index of the person in `tracks`.
-        fps: frames per second.
+    Markers are the 17 joints, and heels and toes where the clip has them. Rows cover every frame
+    from the person's first to last joint; a missing joint has empty cells. `Frame#` is the match
+    frame plus one, as such files count from one, and `Time` is that of the match frame [s].
+    Coordinates are y up, in millimetres.
     """
     trc_decimals = 3  # decimals of all coordinates: a micrometre
     first, markers = _rows(tracks, person)
@@ -233,21 +221,13 @@ BVH_DECIMALS: Final = 6
 
 
 def write_motion(path: Path, model: BodyModel, poses: BodyParameters, fps: float) -> None:
-    """Write one person's motion as a BVH file, whole or not at all.
+    """Write one person's poses (frames,), complete, as a BVH file, whole or not at all.
 
-    The skeleton has the model's 24 joints in T-pose, with the bone lengths of the person's betas;
-    leaf joints end in half of their bone, only for display. The root has position and rotation,
-    every other joint its rotation relative to its parent; angles are in degrees and apply in the
-    order z, x, y of the file's axes. Lengths are centimetres and y is up.
-
-    Args:
-        path: the file.
-        model: body model of the parameters.
-        poses: (frames,) poses of one person, complete; the betas are those of the first frame.
-        fps: frames per second.
-
-    Raises:
-        InputError: there are no frames, or a parameter is missing.
+    The skeleton has the model's 24 joints in T-pose, with the bone lengths of the first frame's
+    betas; leaf joints end in half of their bone, only for display. The root has position and
+    rotation, every other joint its rotation relative to its parent; angles are in degrees and apply
+    in the order z, x, y of the file's axes. Lengths are centimetres and y is up. InputError for no
+    frames.
     """
     centimetres = 100.0  # in a metre: animation tools take numbers of BVH for them
     angles = np.concatenate([poses.global_orient, poses.body_pose], axis=-1)
@@ -392,16 +372,10 @@ def opensim_coordinates(model: BodyModel, poses: BodyParameters) -> Floats:
 def write_opensim_motion(
     path: Path, coordinates: Floats, times: Floats, notes: Mapping[str, str]
 ) -> None:
-    """Write coordinates over time as a .mot file, whole or not at all.
+    """Write coordinates (frames, 27) [deg, m] of `opensim_coordinates` as a .mot file.
 
-    Args:
-        path: the file.
-        coordinates: (frames, 27) [deg, m], as `opensim_coordinates` returns them.
-        times: (frames,) [s].
-        notes: texts of the header, one line each.
-
-    Raises:
-        InputError: there are no frames, or a value is missing.
+    They are at times (frames,) [s], and the header has `notes`, one line each. InputError for no
+    frames, or a missing value.
     """
     mot_decimals = 5  # decimals of degrees, metres and seconds
     if not len(coordinates) or not np.isfinite(coordinates).all():

@@ -17,14 +17,9 @@ from worldpose.errors import InputError
 
 
 def plain_entries(where: str, items: Iterable[Any]) -> Iterator[Any]:
-    """Yield entries of COCO results, those of other forms with their frames as image ids.
+    """Yield entries of COCO results as they are, those of other forms with frames as image ids.
 
-    Args:
-        where: the file, for messages.
-        items: entries of its list; those of COCO stay as they are.
-
-    Raises:
-        InputError: MMPose's first frame is neither 0 nor 1, or an entry has no frame.
+    InputError if MMPose's first frame is neither 0 nor 1, or an entry has no frame.
     """
     first: int | None = None
     for index, item in enumerate(items):

@@ -31,13 +31,10 @@ RELEASE_SIZE: Final = (1920, 1080)
 
 
 def write_static_camera(path: Path, calibration: CameraCalibration) -> None:
-    """Write a static camera as npz with one row.
+    """Write a static camera as npz with one row, of names and shapes as in the released files.
 
     Members, float64: `K` (1, 3, 3) [px], `k` (1, 5) k1 k2 p1 p2 k3, `R` (1, 3, 3) and `t` (1, 3)
     [m] of x_cam = R x_world + t.
-
-    Note:
-        The names and shapes are those of the released files, which have one row per frame.
     """
     (fx, fy), (cx, cy) = calibration.focal_px, calibration.principal_point_px
     arrays = {
@@ -70,17 +67,10 @@ def camera_arrays(camera: Camera) -> dict[str, Floats]:
 def read_camera(path: Path, image_size: tuple[int, int] | None = None) -> Camera:
     """Read the camera of a file: a single one if it has one row, else a batch (frames,).
 
-    The batch is NaN where a frame has no camera.
-
-    Args:
-        path: the file.
-        image_size: width and height [px]; None = those of a released camera, or of an image about
-            the principal point where that is off alike along both axes.
-
-    Raises:
-        InputError: the file is absent, has missing or unknown members, wrong shapes or no rows, a K
-            with skew or without focal length, or an R that is not a rotation; the error names file
-            and place.
+    The batch is NaN where a frame has no camera. `image_size` is width and height [px]; None =
+    those of a released camera, or of an image about the principal point where that is off alike
+    along both axes. InputError also for a K with skew or without focal length, or an R that is no
+    rotation.
     """
     arrays = read_archive(path, MEMBERS)
     k, rotation = arrays["K"], arrays["R"].copy()
@@ -159,13 +149,8 @@ class CameraRows:
 def read_kit_camera(path: Path, image_size: tuple[int, int]) -> Camera:
     """Return the camera (frames,) of a challenge's file, whose pose is NaN where it has none.
 
-    Args:
-        path: K and k of every frame, R and t of every frame or of the first alone.
-        image_size: width and height [px].
-
-    Raises:
-        InputError: as `read_camera`; or another number of poses, unequal focal lengths of the two
-            axes, or distortion beyond k1 and k2.
+    R and t are those of every frame or of the first alone; `image_size` is width and height [px].
+    InputError as `read_camera`, and for unequal focal lengths, or distortion beyond k1 and k2.
     """
     arrays = read_archive(path, _ROW_MEMBERS)
     intrinsics, distortion, poses = arrays["K"], arrays["k"], len(arrays["R"])
@@ -202,12 +187,7 @@ def read_kit_camera(path: Path, image_size: tuple[int, int]) -> Camera:
 
 
 def read_camera_rows(path: Path) -> CameraRows:
-    """Read the rows of a camera file without validation; `read_camera` refuses invalid cameras.
-
-    Raises:
-        InputError: the file is absent, or one of its members is missing, unknown or of the wrong
-            shape; the error names file and member.
-    """
+    """Read the rows of a camera file without validation; `read_camera` refuses invalid cameras."""
     arrays = read_archive(path, _ROW_MEMBERS)
     count, poses = len(arrays["K"]), len(arrays["R"])
     rotation, translation = arrays["R"], arrays["t"]

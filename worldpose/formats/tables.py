@@ -77,13 +77,9 @@ def write_rows(
     parts: Sequence[tuple[NDArray[Any], str]],
     separator: str = "\t",
 ) -> None:
-    """Write a text of header lines and a table, whole or not at all.
+    """Write header lines and a table, whole or not at all.
 
-    Args:
-        path: the file.
-        head: lines before the table.
-        parts: arrays (rows,) or (rows, columns) side by side, each with the format of its cells.
-        separator: text between two cells.
+    Parts (rows,) or (rows, columns) stand side by side, each with the format of its cells.
     """
     cells = [
         format_cells(values[:, None] if values.ndim == 1 else values, form)
@@ -128,14 +124,9 @@ def joints_table(tracks: JointTracks, fps: float, people: Mapping[int, str]) -> 
 
     Heels and toes follow the 17 joints of a person where the clip has them.
 
-    Columns: frame, time_s (frame / fps), person, kind (of the person), joint, x_m, y_m, z_m
+    Columns: frame, time_s (frame / fps), person, kind (of `people`, by id), joint, x_m, y_m, z_m
     (world), x_std_m, y_std_m, z_std_m, views (cameras that contribute), filled (no camera does),
     source (as in `JointTracks`; 0 at heels and toes).
-
-    Args:
-        tracks: the joints.
-        fps: frames per second.
-        people: the kind of each person, by id.
     """
     import pandas as pd  # late: it takes half a second
 
@@ -307,12 +298,7 @@ def write_parquet(path: Path, table: pd.DataFrame, notes: Mapping[str, str]) -> 
 
 
 def read_parquet(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Return columns of a Parquet file by name.
-
-    Raises:
-        InputError: the file is unreadable or lacks a column.
-        UsageError: pyarrow is not installed.
-    """
+    """Return columns of a Parquet file by name; UsageError if pyarrow is not installed."""
     pa, parquet = _import_pyarrow(str(path), "give an npz file")
     try:
         table = parquet.read_table(path)

@@ -42,14 +42,10 @@ def write_usd(
 
     The stage is in metres, z up, as the world is; a time code is a frame. Each person is a SkelRoot
     with a skeleton of 24 joints, its animation, and a mesh with the person's shape and the model's
-    skinning weights, without pose correctives. A missing person is invisible. Cameras have
-    focal length, principal point and pose, and their distortion as custom data, or as an attribute
-    of the same name with time samples where it changes. Arguments are as of `write_gltf`; `notes`
-    become the stage's custom data.
-
-    Raises:
-        InputError: no person has a body.
-        UsageError: the library is not installed.
+    skinning weights, without pose correctives. A missing person is invisible. Cameras have focal
+    length, principal point and pose, and their distortion as custom data, or as an attribute of the
+    same name with time samples where it changes. Arguments and errors are as of `write_gltf`;
+    `notes` become the stage's custom data. UsageError if the library is not installed.
     """
     present = people_with_bodies(path, people)
     try:

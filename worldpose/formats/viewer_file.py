@@ -188,13 +188,7 @@ def encode_scene(clip: ViewerClip) -> bytes:
 
 
 def encode_frames(clip: ViewerClip, first: int, count: int) -> bytes:
-    """Return people and the moving cameras in some frames.
-
-    Args:
-        clip: the clip.
-        first: index of the first frame.
-        count: number of frames; a part has at most those of a range.
-    """
+    """Return people and the moving cameras in `count` frames from index `first` of a clip."""
     here = slice(first, first + min(count, clip.range_frames))
     joints = clip.joints[here]
     arrays: Arrays = {}
@@ -266,16 +260,9 @@ def decode_bodies(scene: bytes, frames: bytes) -> tuple[Floats, Floats]:
 def write_viewer(
     path: Path, page: str, clips: Sequence[ViewerClip], videos: Mapping[str, Path]
 ) -> None:
-    """Write a page with clips inside, which opens from disk without a network.
+    """Write the built `page` with clips and their videos (mp4) inside, whole or not at all.
 
-    Args:
-        path: the file, written whole or not at all.
-        page: the built page of the viewer, scripts and style inside.
-        clips: the clips.
-        videos: mp4 files by clip.
-
-    Raises:
-        InputError: nobody is in the clips, or the file would be too large.
+    It opens from disk without a network. InputError if nobody is in the clips, or it is too large.
     """
     if not any(clip.has_people for clip in clips):
         expected = "a person with joints, a body or a place on the pitch"
@@ -353,15 +340,8 @@ def _quantize_rotations(
     """Return rotation vectors relative to the parents in whole units, and each joint's unit [rad].
 
     A joint's rotation relative to the world is rounded once only: the next one is relative to what
-    its parent became by rounding.
-
-    Args:
-        model: body model of the poses.
-        poses: (frames, bodies).
-        there: (frames, bodies), which of them are known; the others get zeros.
-
-    Returns:
-        (frames, bodies, 24, 3), and (24,).
+    its parent became by rounding. Poses (frames, bodies) that are not `there` get zeros. The shapes
+    are (frames, bodies, 24, 3) and (24,).
     """
     parents = model.parents
     rotations = model.articulate(poses[there]).rotations

@@ -15,13 +15,9 @@ def box_areas(boxes: AnyFloats) -> Floats:
 
 
 def box_iou(a: AnyFloats, b: AnyFloats) -> Floats:
-    """Return the intersection over union (..., n, m) [1] of every pair of boxes.
+    """Return the intersection over union (..., n, m) [1] of boxes (..., n, 4) and (..., m, 4) [px].
 
     It is 0 for disjoint boxes, for boxes without area and for boxes with NaN.
-
-    Args:
-        a: (..., n, 4) x0, y0, x1, y1 [px].
-        b: (..., m, 4) [px].
     """
     # Each side by itself: operations along an axis of four numbers take several times as long.
     x0, y0, x1, y1 = (a[..., :, None, side] for side in range(4))

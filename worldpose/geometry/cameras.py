@@ -30,10 +30,7 @@ _PARTS = {"focal": 2, "principal_point": 2, "distortion": 8, "image_size": 2}
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """Pixels of world points, and their derivatives by the point and by the camera.
-
-    All arrays are NaN where `status` is not OK.
-    """
+    """Pixels of world points and their derivatives; all are NaN where `status` is not OK."""
 
     points_image: Floats
     """(..., n, 2) [px]."""

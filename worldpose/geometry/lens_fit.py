@@ -30,13 +30,7 @@ INTRINSICS: Final = _PARAMETERS[:4]
 
 @dataclass(frozen=True, eq=False)
 class FittedLens:
-    """A lens fitted to places and their pixels.
-
-    Attributes:
-        camera: a single camera at the origin.
-        plane: (n, 2) places on the plane z = 1.
-        pixels: (n, 2) [px].
-    """
+    """A lens at the origin fitted to places (n, 2) on the plane z = 1 and their pixels (n, 2)."""
 
     camera: Camera
     plane: Floats
@@ -83,12 +77,8 @@ def fit_lens(
 ) -> FittedLens:
     """Return the lens of a model that images places (n, 2) on the plane z = 1 at pixels (n, 2).
 
-    Args:
-        lens: a single camera, whose focal length and principal point are a start.
-        plane: finite places.
-        pixels: their pixels [px].
-        model: lens model; coefficients that are not free are 0.
-        free: names of the free parameters, of `INTRINSICS` and `DISTORTION`.
+    The single camera `lens` has focal length and principal point to start from; places are finite.
+    The free parameters are of `INTRINSICS` and `DISTORTION`; coefficients that are not free are 0.
     """
     start = replace(lens, distortion=np.zeros(8), lens_model=model, cam_from_world=Rigid.identity())
     chosen = [_PARAMETERS.index(name) for name in free]
@@ -126,12 +116,9 @@ def fit_brown_lens(
     polynomial follows a fisheye, and places there would spoil the middle: if a fit to the whole
     image has gross errors, it is to the widest cone about the axis in which errors are small.
 
-    Returns:
-        The camera, and `max_error_px` within `fitted_angle_deg` of the axis, and
-        `max_error_beyond_px` over the rest of the image; None where Brown's lens folds there.
-
-    Raises:
-        InputError: errors are small in less than half of the image.
+    The errors are `max_error_px` within `fitted_angle_deg` of the axis, and `max_error_beyond_px`
+    over the rest of the image; None where Brown's lens folds there. InputError if errors are small
+    in less than half of the image.
     """
     # Small and gross errors [px]: 2.2 and 11 px of Full HD.
     most_px, gross_px = (share * float(np.hypot(*camera.image_size)) for share in (0.001, 0.005))

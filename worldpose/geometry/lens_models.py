@@ -61,10 +61,7 @@ WIDTH: Final = 26
 
 
 class CameraNumbers(NamedTuple):
-    """Numbers of a camera's row, for functions of one point.
-
-    A tuple stays in registers; for an array, references would be counted at every call.
-    """
+    """Numbers of a camera's row in registers: an array's references would be counted each time."""
 
     fx: float
     fy: float
@@ -105,9 +102,7 @@ _MISFIT = 1e-13
 def lens_rows(distortion: Floats, model: ArrayLike = LensModel.BROWN) -> Floats:
     """Return rows (..., WIDTH) of lenses alone, with their folds; other numbers are 0.
 
-    Args:
-        distortion: (..., 5) k1 k2 p1 p2 k3 or (..., 8), then k4 k5 k6.
-        model: (...) LensModel.
+    The distortion is (..., 5) k1 k2 p1 p2 k3 or (..., 8), then k4 k5 k6, the LensModel (...).
     """
     rows = np.zeros((*distortion.shape[:-1], WIDTH))
     rows[..., 4:9] = distortion[..., :5]
@@ -118,17 +113,10 @@ def lens_rows(distortion: Floats, model: ArrayLike = LensModel.BROWN) -> Floats:
 
 
 def fold_radius(distortion: ArrayLike) -> Floats:
-    """Return the undistorted radius on the plane z = 1 where Brown's model folds.
+    """Return the undistorted radius (...) on the plane z = 1 where Brown's model folds.
 
-    Args:
-        distortion: (..., 5) k1 k2 p1 p2 k3.
-
-    Returns:
-        (...) radius; infinite without a fold within a radius of 1e6, NaN where a coefficient is
-        missing.
-
-    Raises:
-        InputError: the last dimension is not 5.
+    The distortion is (..., 5) k1 k2 p1 p2 k3, or InputError. The radius is infinite without a fold
+    within a radius of 1e6, NaN where a coefficient is missing.
     """
     radius: Floats = lens_rows(check_shape("fold_radius: distortion", distortion, (5,)))[..., 21]
     return radius

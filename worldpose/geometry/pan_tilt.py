@@ -9,13 +9,10 @@ from worldpose.geometry.cameras import Camera
 
 
 def camera_angles(camera: Camera) -> tuple[Floats, Floats, Floats]:
-    """Return pan, tilt and roll (frames,) of a camera [deg].
+    """Return pan, tilt and roll (frames,) of a camera (frames,) [deg].
 
     Pan is from the world's y axis towards x, tilt from the horizon upwards, roll clockwise about
     the view: a camera that rolls so shows a horizon that turns the other way.
-
-    Args:
-        camera: a batch (frames,).
     """
     right, down, ahead = np.moveaxis(camera.cam_from_world.rotation, 1, 0)
     pan = np.degrees(np.arctan2(ahead[:, 0], ahead[:, 1]))

@@ -90,13 +90,9 @@ class Surface(NamedTuple):
 def draw_triangles(surface: Surface, haze: Singles, which: int, samples: Samples) -> int:
     """Draw one object into the z-buffer, and return the number of samples it would cover alone.
 
-    Triangles that face away or have a vertex without an image are skipped.
-
-    Args:
-        surface: the object.
-        haze: (4,) share of the haze in front of it, and the haze's colour [levels of 255].
-        which: number of the object, from 0.
-        samples: written.
+    Triangles that face away or have a vertex without an image are skipped. The haze (4,) is its
+    share in front of the object, and its colour [levels of 255]; `which` is the object's number,
+    from 0.
     """
     # Moments of samples, as a share of the time that the shutter is open.
     when = (0.125, 0.625, 0.375, 0.875)
@@ -155,13 +151,10 @@ def draw_triangles(surface: Surface, haze: Singles, which: int, samples: Samples
 
 @compile_kernel
 def cover_triangles(pixels: Singles, faces: NDArray[np.int32], bit: int, mask: Image) -> None:
-    """Set a bit in the pixels whose centres lie within triangles of either orientation.
+    """Set a bit, a power of 2, in pixels whose centres lie within triangles of either orientation.
 
-    Args:
-        pixels: (vertices, 2) [px]; triangles with a NaN are skipped.
-        faces: (triangles, 3).
-        bit: bit to set, a power of 2.
-        mask: (height, width), written.
+    Of pixels (vertices, 2) [px], faces (triangles, 3) with a NaN are skipped; the mask (height,
+    width) is written.
     """
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
@@ -189,13 +182,10 @@ def resolve(
 ) -> None:
     """Blend samples into a part of an image, and write the person in at least half of each pixel.
 
-    Args:
-        who: (height, width, 4) of `Samples`.
-        color: (height, width, 4, 3) color of `Samples`.
-        picture: (height, width, 3) RGB, changed in place.
-        persons: (height, width), written where half of the samples show a person; objects from
-            len(seen) on are no people.
-        seen: (persons,) number of samples of each, added to.
+    `who` (height, width, 4) and `color` (height, width, 4, 3) are of `Samples`; the picture
+    (height, width, 3) RGB changes in place. `persons` (height, width) is written where half of the
+    samples show one of the len(seen) people, whose numbers of samples are added to `seen`
+    (persons,).
     """
     for v in range(who.shape[0]):
         for u in range(who.shape[1]):

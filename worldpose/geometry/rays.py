@@ -67,24 +67,14 @@ class Rays:
 def intersect_rays(rays: Rays, weights: ArrayLike | None = None) -> tuple[Floats, Floats]:
     """Return the points nearest to each bundle of rays in the weighted least-squares sense.
 
-    The point p minimises the sum of weight * squared distance to the lines of the rays.
+    The point p minimises the sum of weight * squared distance to the lines of the rays (..., m).
+    Missing rays are left out, as are those whose weight (..., m) is 0 or NaN; None weighs all
+    alike. InputError if one is negative.
 
-    Args:
-        rays: (..., m) bundles of m rays; missing rays are left out.
-        weights: (..., m), not negative; 0 or NaN leaves a ray out; None weighs all rays alike.
-
-    Returns:
-        Points (..., 3) [m], world, and normal matrices (..., 3, 3), the sums of
-        weight * (identity - d d^T). With weights 1 / sigma^2 [1/m^2] the inverse of a normal
-        matrix is the covariance of its point. Points are NaN where fewer than two rays remain
-        or all remaining rays are parallel.
-
-    Raises:
-        InputError: a weight is negative.
-
-    Note:
-        Parallel means an angle below about 2e-6 rad, where rounding moves the point by more
-        than a millimetre at 100 m.
+    Returned are points (..., 3) [m], world, and normal matrices (..., 3, 3), the sums of weight *
+    (identity - d d^T). With weights 1 / sigma^2 [1/m^2] the inverse of a normal matrix is the
+    covariance of its point. Points are NaN where fewer than two rays remain or all remaining rays
+    are parallel, to about 2e-6 rad: rounding then moves the point by over a millimetre at 100 m.
     """
     weight = np.ones(rays.status.shape) if weights is None else np.asarray(weights, dtype=float)
     if np.any(weight < 0.0):

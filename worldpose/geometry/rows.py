@@ -16,13 +16,7 @@ Index = NDArray[np.integer] | Flags | slice
 
 
 def take_rows(record: Record, index: Index, *shared: str) -> Record:
-    """Return a record with some rows of its arrays.
-
-    Args:
-        record: dataclass or named tuple of arrays (n, ...).
-        index: the rows.
-        shared: fields that stay as they are.
-    """
+    """Return a record of arrays (n, ...) with some of their rows; `shared` fields stay."""
     return type(record)(
         *(
             getattr(record, name) if name in shared else getattr(record, name)[index]
@@ -32,10 +26,7 @@ def take_rows(record: Record, index: Index, *shared: str) -> Record:
 
 
 def join_rows(parts: Sequence[Record], *shared: str) -> Record:
-    """Return one record with the arrays of one or more records, one after another.
-
-    `shared` are fields that all records have in common.
-    """
+    """Return one record with the arrays of some, one after another, and their `shared` fields."""
     return type(parts[0])(
         *(
             getattr(parts[0], name)

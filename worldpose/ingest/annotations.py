@@ -39,16 +39,10 @@ def key_frames_file(clip_id: str) -> str:
 def read_clicked(
     folder: Path, spec: MatchSpec, pitch: PitchSpec | None, whose: str | None = "the pitch"
 ) -> dict[str, ClickedMarkings]:
-    """Return the clicks of the static cameras of a match folder, in their order.
+    """Return the clicks of a match's static cameras, in their order.
 
-    Args:
-        folder: the match folder.
-        spec: its match.yaml.
-        pitch: its pitch; None without a pitch.
-        whose: the pitch in words, for messages; None = names are not checked.
-
-    Raises:
-        InputError: a file belongs to no static camera, or is invalid.
+    There is no pitch if it is None; `whose` it is serves messages, None = names are not checked.
+    InputError if a file belongs to no static camera.
     """
     static = {camera.id: camera for camera in spec.static_cameras}
     clicked = {}
@@ -62,18 +56,10 @@ def read_clicked(
 def read_clicked_markings(
     file: Path, camera: CameraSpec, pitch: PitchSpec | None, whose: str | None = "the pitch"
 ) -> ClickedMarkings:
-    """Return the clicks in one camera's image.
+    """Return the clicks, a `ClickedMarkings` of JSON, that are inside one camera's image.
 
-    Args:
-        file: JSON, a `ClickedMarkings`.
-        camera: the camera; all clicks must be inside its image.
-        pitch: the match's pitch; its template defines the names.
-        whose: as in `read_clicked`.
-
-    Raises:
-        InputError: the file is not JSON, or has an unknown key or name, no number, a repeated name,
-            a pixel outside the image, or no clicks, or the match has no pitch; the error names file
-            and entry.
+    The pitch's template defines the names; `whose` is as in `read_clicked`. InputError also for a
+    repeated name, no clicks, or no pitch; the error names file and entry.
     """
     template = _template(file, pitch, whose)
     clicked = validate_record(ClickedMarkings, read_json(file), str(file))
@@ -84,11 +70,7 @@ def read_clicked_markings(
 def read_key_frames(
     folder: Path, spec: MatchSpec, pitch: PitchSpec | None, whose: str | None = "the pitch"
 ) -> dict[str, KeyFrames]:
-    """Return the clicked key frames by broadcast view, in their order; see `read_clicked`.
-
-    Raises:
-        InputError: a file belongs to no clip with a broadcast camera, or is invalid.
-    """
+    """Return the clicked key frames by broadcast view, in their order; see `read_clicked`."""
     views, picked = spec.broadcast_views, {}
     of_clips = f"<clip>.json of {BROADCAST_FILES}"
     files = files_by_unit(folder, KEY_FRAMES_FOLDER, (".json",), views, of_clips, alone=True)

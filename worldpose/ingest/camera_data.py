@@ -36,19 +36,12 @@ def import_camera_data(
     number: int | None = None,
     zoom_table: Path | None = None,
 ) -> tuple[Path, CameraData]:
-    """Write camera data into a match folder, and return the new file and its content.
+    """Write the camera data of `file` into a match folder, and return the new file and its content.
 
-    Args:
-        file: what `read_camera_data` reads.
-        folder: the match folder.
-        view: the broadcast view, None = the only one.
-        first: number in the view's video of the file's first frame; None = as the file says.
-        number: FreeD's number of the camera; None = the only one of the file.
-        zoom_table: focal lengths of the lens by zoom counts.
-
-    Raises:
-        InputError: a file is invalid or has no frame of the view, or the view has camera data
-            already.
+    `view` None is the only broadcast view; `first` is the number in its video of the file's first
+    frame; None = as the file says. `number` is FreeD's of the camera, None = the only one, and
+    `zoom_table` has the lens's focal lengths by zoom counts. InputError if the file has no frame of
+    the view, or the view has camera data already.
     """
     match = read_match(folder, whose=None)
     views = match.spec.broadcast_views

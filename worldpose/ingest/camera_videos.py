@@ -37,15 +37,8 @@ def find_videos(
 
     A camera is called as its file or folder. Chapters of one recording are in the folder, or in a
     folder of the camera, as may be its only video, unless a file beside that folder has its name.
-
-    Args:
-        folder: holds them.
-        workshop: where chapters of one recording are joined to one file; None = they are refused.
-        named: whether each file of the folder is the video of a camera, even if it is named as a
-            chapter.
-
-    Raises:
-        InputError: two videos have one name, or chapters are not to be joined.
+    They are joined in `workshop`; InputError without one, or if two videos have one name. If
+    `named`, each file of the folder is the video of a camera, even if it is named as a chapter.
     """
     videos = _films_in(folder)
     groups = [[file] for file in videos] if named else _recordings(videos)
@@ -75,10 +68,7 @@ def find_videos(
 def without_strays(
     folder: Path, found: Mapping[str, Path], cameras: Collection[str]
 ) -> dict[str, Path]:
-    """Return the videos of `find_videos` that are of cameras, perhaps not all of these cameras.
-
-    Beside videos in the folder itself, the only video of a subfolder may be anything.
-    """
+    """Return the videos of cameras; beside videos in a folder, a subfolder's may be anything."""
     is_mixed = bool(_films_in(folder))
     return {
         name: file
@@ -185,10 +175,7 @@ def describe_videos(
 ) -> list[str]:
     """Return sentences about what cameras' videos lack.
 
-    Args:
-        files: the videos.
-        indices: their frames.
-        clocks: (frames,) number of the video frame for each frame of the clock; -1 = missing.
+    A clock (frames,) has the number of the video frame for each of its frames; -1 = missing.
     """
     notes = []
     for name, clock in clocks.items():
@@ -225,11 +212,8 @@ def shared_length(counts: Iterable[int]) -> int:
 def describe_gaps(clock: Integers, frame: Integers | None = None) -> str:
     """Return a sentence about the frames that a video lacks; empty if there are none.
 
-    A start or end up to a hundredth of the frames early or late is usual.
-
-    Args:
-        clock: (frames,) number of the video frame; -1 = missing.
-        frame: (frames,) rising numbers to name them by; None = from 0.
+    A start or end up to a hundredth of the frames early or late is usual. The clock (frames,) has
+    numbers of video frames; -1 = missing. `frame` (frames,) rises and names them; None = from 0.
     """
     shown = np.flatnonzero(clock >= 0)
     if not len(shown):
@@ -280,18 +264,10 @@ def fit_to_video(
 ) -> CameraCalibration:
     """Return a camera in the pixels of its video, which may be resized, or have black bars.
 
-    Args:
-        file: the video.
-        camera: the camera in the calibrated pixels.
-        index: the video's frames.
-        notes: sentences for the user, to which a change is added.
-        of_sensor: whether the calibration is of the sensor (`is_of_sensor`), of which a smaller
-            video is the middle part, as in Vicon's video modes.
-        has_poses: whether 2D poses can contradict that where a resized video has the same shape.
-
-    Raises:
-        InputError: the video is neither what was calibrated nor the same picture resized, or
-            perhaps both the middle part of it and the same picture resized.
+    A change adds a sentence to `notes`. If the calibration is `of_sensor` (`is_of_sensor`), a
+    smaller video is its middle part, as in Vicon's video modes; where a resized video has the same
+    shape, 2D poses, if `has_poses`, can contradict that. InputError if the video is neither what
+    was calibrated nor the same picture resized, or may be the middle part as well as that.
     """
     same_shape = 0.002  # largest relative difference of shapes [1]: sides are whole pixels
     if index.size == camera.image_size:

@@ -43,13 +43,11 @@ class KitSequence:
     """Inputs of one sequence.
 
     Attributes:
-        name: of the sequence.
         camera: (frames,); its pose is NaN where the file has none.
         boxes: (frames, persons, 4) x0, y0, x1, y1 [px]; NaN when absent.
         skel_2d: (frames, persons, 17, 2) [px], COCO-17; NaN where unknown. None without a file.
         skel_3d: (frames, persons, 17, 3) [m], camera axes. None without a file.
         video: the video, or the folder of numbered images.
-        index: its frames.
     """
 
     name: str
@@ -68,18 +66,12 @@ def import_challenge(
 
     The kit has `cameras/<sequence>.npz` (K and k of every frame, R and t of the first or of every
     one), `boxes/<sequence>.npy`, `videos/<sequence>.mp4` or `images/<sequence>/`,
-    `pitch_points.txt`, and possibly `skel_2d/` and `skel_3d/`. Boxes and skeletons have one row
-    per person. The boxes become tracks with the row as id, 2D skeletons become keypoints, and 3D
-    skeletons become monocular poses.
+    `pitch_points.txt`, and possibly `skel_2d/` and `skel_3d/`. Boxes and skeletons have one row per
+    person. The boxes become tracks with the row as id, 2D skeletons become keypoints, and 3D
+    skeletons become monocular poses, after `lift` turns each into rotations of the body's joints.
 
-    Args:
-        kit: the folder.
-        out: holds the new folders.
-        lift: turns a 3D skeleton into rotations of the body's joints.
-        fps: frames per second [1/s]; None = that of the videos; images have none.
-
-    Raises:
-        InputError: a file is missing, invalid, or contradicts another one. Nothing is written.
+    `fps` [1/s] None is that of the videos; images have none. InputError if a file is missing,
+    invalid, or contradicts another one; nothing is written then.
     """
     pitch = _read_pitch(kit / "pitch_points.txt")
     cameras = sorted((kit / "cameras").glob("[!.]*.npz"))

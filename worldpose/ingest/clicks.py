@@ -47,7 +47,6 @@ class RepeatedClick:
 
     Attributes:
         owner: the static camera, or the clip.
-        image: name of the image.
         label: label as in the file.
         names: names of the first click and of the repeated click, in the match folder.
         pixels: pixels of both clicks [px].
@@ -67,9 +66,8 @@ class ImportedClicks:
     Attributes:
         files: written, relative to the match folder.
         clicks: number of clicks and drawn lines, by camera or clip.
-        own_points: points that the rules do not name, with their places [m, world]: x, y of a
-            point on the surface, x, y, z of a copy of a point whose height is known.
-        repeated: labels that were clicked more than once in one image.
+        own_points: points that the rules do not name, with their places [m, world]: x, y of a point
+            on the surface, x, y, z of a copy of a point whose height is known.
         notes: sentences about what was left out.
         mirrored: whether the labels' y axis points towards the near side; None without coordinates.
     """
@@ -91,26 +89,20 @@ def import_clicks(
 ) -> ImportedClicks:
     """Write the labelled points of an annotation file into a match folder.
 
+    The file is CVAT for images XML, Label Studio JSON, COCO keypoints JSON or SoccerNet's lines.
     Labels are names of the pitch template or SoccerNet's of lines, without regard to case and
-    spaces, or places in metres: from a corner along the touch line
-    and the goal line, or, if some are negative or clearly more of them are points of the pitch
-    then, from the centre spot. On which side y is positive
-    follows from the clicks: no camera above a pitch sees it mirrored. Places that neither the Laws
-    nor pitch.json name become points of pitch.json. A label that is clicked twice in one image
-    gives two points at one place, from which calibration tells the wrong one.
+    spaces, or places in metres: from a corner along the touch line and the goal line, or, if some
+    are negative or clearly more of them are points of the pitch then, from the centre spot. On
+    which side y is positive follows from the clicks: no camera above a pitch sees it mirrored.
+    Places that neither the Laws nor pitch.json name become points of pitch.json. A label that is
+    clicked twice in one image gives two points at one place, from which calibration tells the wrong
+    one.
 
-    Args:
-        file: CVAT for images XML, Label Studio JSON, COCO keypoints JSON or SoccerNet's lines.
-        folder: the match folder, with match.yaml.
-        owner: the static camera, or the broadcast view whose key frames are numbered by the images'
-            names; None: the images are named after cameras.
-        pitch: the match's pitch; None = the folder's or the standard one.
-        runs: MATCH/NUMBER of the runs that were computed with that pitch.
-
-    Raises:
-        InputError: the file has another form; a label is unknown; an image belongs to no camera, or
-            has another size; clicks exist already; places depend on a venue's unknown pitch; or
-            points are to be added to a pitch that has runs.
+    `owner` is the static camera, or the broadcast view whose key frames are numbered by the images'
+    names; None: the images are named after cameras. `pitch` None is the folder's or the standard
+    one, and `runs`, as MATCH/NUMBER, were computed with it. InputError for an unknown label or
+    image, an image of another size, clicks that exist already, places that depend on a venue's
+    unknown pitch, or points to add to a pitch that has runs.
     """
     spec = read_spec(folder)
     is_unknown = pitch is None and spec.venue is not None and pitch_file(folder, spec) is None

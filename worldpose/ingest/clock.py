@@ -26,10 +26,7 @@ from worldpose.errors import InputError
 def row_rate(where: str, fps: float, frame: Integers | None = None) -> float:
     """Return the rows per second of rows with these frame numbers (n,), `fps` numbers a second.
 
-    Without numbers, a row is a frame.
-
-    Raises:
-        InputError: `fps` is no positive number, or the frames do not rise in equal steps.
+    Without numbers, a row is a frame. InputError for another `fps`, or frames in unequal steps.
     """
     if not isinstance(fps, int | float | np.number) or not 0.0 < fps < np.inf:
         todo = "Give the frame rate of the recording, such as 25.0."
@@ -43,13 +40,7 @@ def row_rate(where: str, fps: float, frame: Integers | None = None) -> float:
 
 
 def exact_frames(frame: Integers, offset: ClockOffset, rate: float = 1.0) -> Floats:
-    """Return the exact camera frames (n,) of match frames (n,).
-
-    Args:
-        frame: match frames.
-        offset: as the camera's `offset_frames`.
-        rate: frames of the camera per frame of the match.
-    """
+    """Return the exact frames (n,) of a camera, `rate` per match frame, at match frames (n,)."""
     if not isinstance(offset, Sequence):
         return np.asarray(frame * rate + offset, dtype=np.float64)
     at, there = np.array(offset, dtype=np.float64).T
@@ -127,13 +118,10 @@ class ImageClock:
 
     @classmethod
     def of(cls, frame: Integers, offset: ClockOffset, rate: float, start: float) -> ImageClock:
-        """Return the clock of a clip with these match frames (frames,), the first with `start`.
+        """Return the clock of a clip with consecutive match frames (frames,), from image `start`.
 
-        Args:
-            frame: consecutive match frames.
-            offset: as of `worldpose.ingest.footage.UnitFrames`.
-            rate: images per match frame.
-            start: exact number of the image at the first match frame.
+        `rate` is in images per match frame, and `offset` as of
+        `worldpose.ingest.footage.UnitFrames`.
         """
         number = camera_frames(frame, offset, rate)
         return cls(number, (number - start) / rate - (frame - frame[0]), rate)

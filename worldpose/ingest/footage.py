@@ -196,16 +196,9 @@ def read_footage(
 ) -> Footage:
     """Return a video's synchronization with the match's clock, decoding only its first frame.
 
-    Args:
-        path: a video file or a folder of images.
-        fps: frames per second of the camera.
-        image_size: width, height from match.yaml [px].
-        frames: the unit's frames in the match.
-        clips: id, first match frame and number of frames of each clip.
-        index: index of the video; None = read it from the video.
-
-    Raises:
-        InputError: no video, another size or rate, or no frame of any clip.
+    `fps` [1/s] and `image_size`, width, height [px], are those of match.yaml. A clip is id, first
+    match frame and number of frames; `index` None is read from the video. InputError for no video,
+    another size or rate, or no frame of any clip.
     """
     from worldpose.video.folder import index_video  # late: most commands open no video
 

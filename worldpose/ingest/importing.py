@@ -216,17 +216,9 @@ def import_lenses(
 ) -> dict[str, LensCalibration]:
     """Write lenses without a pose into a match folder's lenses.toml, and return them.
 
-    Static calibration takes them as prior of focal length, principal point and distortion; the
-    pose comes from clicks.
-
-    Args:
-        files: what `read_lenses` reads.
-        folder: the match folder, with match.yaml.
-        camera: the static camera of a file that names none.
-
-    Raises:
-        InputError: a file is invalid, its camera is unknown or has a lens already, or calibration
-            .toml gives it with its pose.
+    Static calibration takes them as prior of focal length, principal point and distortion; the pose
+    comes from clicks. `camera` is the static one of a file for `read_lenses` that names none.
+    InputError if a camera is unknown, or has a lens or a calibration already.
     """
     spec = read_spec(folder)
     sizes = image_sizes(spec)
@@ -255,17 +247,10 @@ def pick_cameras(
 ) -> dict[str, Path]:
     """Return the file of each camera that has one.
 
-    Args:
-        folder: holds them, for messages.
-        found: its files, by name of a camera.
-        cameras: the cameras.
-        calibration: file of the cameras, for messages.
-        suffixes: endings of such files, for messages.
-        left_out: further cameras, whose files are ignored; cameras without a file are added, and a
-            sentence about files without a camera.
-
-    Raises:
-        InputError: fewer than two cameras have a file, or than all of fewer cameras.
+    `found` are the folder's files by name of a camera. `left_out` has cameras whose files are
+    ignored; cameras without a file are added to it, and a sentence about files without a camera.
+    InputError names folder, calibration and suffixes if fewer than two cameras, or fewer than all
+    of one, remain.
     """
     files = {name: file for name, file in found.items() if name not in left_out}
     both = [name for name in cameras if name in files]
@@ -295,17 +280,10 @@ def build_spec(
 ) -> MatchSpec:
     """Return match.yaml of a match with the one clip `clip`.
 
-    Args:
-        out: the match folder, whose name is the match's id if `match_id` is None.
-        match_id: id of the match.
-        fps: frame rate of all cameras [1/s].
-        sizes: width and height of the cameras' images [px].
-        frames: the clip's first frame, and the one after its last.
-        videos: file in `videos/` of those cameras that have one.
-        offsets: `offset_frames` of those cameras whose clock is another.
-
-    Raises:
-        InputError: an entry is invalid.
+    The name of `out` is the match's id if `match_id` is None; `fps` [1/s] is that of all cameras,
+    and sizes are width and height [px]. `frames` are the clip's first one, and the one after its
+    last. `videos` and `offsets` have files in `videos/` and `offset_frames` of the cameras with
+    one.
     """
     content = {
         "match_id": match_id if match_id is not None else name_of(out),

@@ -208,12 +208,9 @@ def _read_match(
 
 
 def require_calibrated(match: MatchFolder) -> None:
-    """Raise InputError for a match with a static camera that has to be clicked.
+    """Raise InputError, with missing cameras and files, if a static camera has to be clicked.
 
     A match without static cameras needs clicked key frames, in one clip at least.
-
-    Raises:
-        InputError: the error names the missing cameras and the required files.
     """
     if not match.spec.static_cameras:
         _require_key_frames(match)

@@ -23,12 +23,7 @@ NO_PITCH: Final = "none"
 
 
 def pitch_file(folder: Path, spec: MatchSpec) -> Path | None:
-    """Return the file of the surveyed pitch; None = no pitch, or the standard one.
-
-    Raises:
-        InputError: match.yaml names a pitch file that is missing or outside, or has `pitch: none`
-            although pitch.json exists.
-    """
+    """Return the file of the surveyed pitch, or None; InputError if match.yaml contradicts it."""
     if spec.pitch == NO_PITCH:
         if (folder / "pitch.json").exists():
             raise _two_pitches(folder, NO_PITCH)
@@ -91,12 +86,7 @@ def _check_size(content: Mapping[str, object], usual: PitchSpec, file: str) -> N
 
 
 def _check_points(points: object, pitch: PitchSpec, file: str) -> None:
-    """Raise InputError for surveyed points far from their places in the rules of the game.
-
-    Raises:
-        InputError: points are too far from there; the error names the point of the largest
-            distance.
-    """
+    """Raise InputError, naming the farthest one, for surveyed points far from their places."""
     from_laws = 2.0  # maximum distance of a surveyed point from its place in the rules, in plan [m]
     if not isinstance(points, dict):
         return  # the contract says what is wrong with them
@@ -135,8 +125,7 @@ def _is_number(value: object) -> TypeGuard[float]:
 def require_free_pitch(folder: Path, runs: Sequence[str] = ()) -> None:
     """Raise InputError if pitch.json must not be written.
 
-    Raises:
-        InputError: match.yaml names another pitch, or none; or `runs` (MATCH/NUMBER) had its pitch.
+    That is if match.yaml names another pitch, or none, or `runs` (MATCH/NUMBER) had its pitch.
     """
     file = folder / "match.yaml"
     content = read_yaml(file) if file.exists() else None

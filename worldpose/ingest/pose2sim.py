@@ -72,19 +72,8 @@ def import_pose2sim(
     smaller or larger than the calibrated images, with or without black bars, its camera is in the
     video's pixels, as the 2D poses are.
 
-    Args:
-        project: folder of a trial.
-        out: the match folder, absent or empty.
-        fps: frame rate of all cameras [1/s]; None = from Config.toml or the videos.
-        match_id: id of the match; None = the name of `out`.
-        place: brings the cameras to metres with z up; None = they are.
-
-    Returns:
-        Content of match.yaml, and sentences about what was found and what was left out.
-
-    Raises:
-        InputError: something is absent, invalid or contradicts the rest; nothing is written then,
-            and the error names file and key.
+    `fps` [1/s] None is that of Config.toml or the videos; `out`, `match_id`, `place`, the result
+    and the errors are as of `import_match`.
     """
     settings, config = _read_pose2sim_settings(project)
     calibration = _find_pose2sim_calibration(project)

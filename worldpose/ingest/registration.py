@@ -79,10 +79,7 @@ def identifying_files(match: MatchFolder) -> set[str]:
 def digest_of_files(path: Path) -> str:
     """Return the SHA-256 of a file, or of the names and contents of a folder's non-hidden files.
 
-    Equals `Registration.digest_of` of the registered files.
-
-    Raises:
-        OSError: a file is unreadable.
+    Equals `Registration.digest_of` of the registered files; OSError if a file is unreadable.
     """
     if not path.is_dir():
         return sha256_of_file(path)

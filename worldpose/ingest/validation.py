@@ -23,16 +23,10 @@ R = TypeVar("R", bound=Record)
 
 
 def validate_record(model: type[R], data: object, file: str) -> R:
-    """Return the record in `data` from `file`, without conversions or ignored keys.
+    """Return the record in `data` as a YAML or JSON reader of `file` returns it, unconverted.
 
-    Args:
-        model: the contract.
-        data: mappings, lists, text and numbers, as returned by a YAML or JSON reader.
-        file: name of the file for messages.
-
-    Raises:
-        InputError: a key is unknown or missing, or a value is invalid; a misspelt key takes
-            precedence over the key that is missing because of it.
+    InputError for an invalid value, or an unknown or missing key; a misspelt key takes precedence
+    over the key that is missing because of it.
     """
     try:
         text = json.dumps(data)
@@ -132,11 +126,7 @@ def require_local(name: str, where: str) -> None:
 
 @contextmanager
 def reachable(folder: Path) -> Iterator[None]:
-    """Convert OSError in a block that reads a match folder to InputError.
-
-    Raises:
-        InputError: the folder, or a file in it, is unreachable or unreadable.
-    """
+    """Convert OSError in a block that reads a match folder, or a file in it, to InputError."""
     try:
         yield
     except OSError as error:
@@ -148,12 +138,7 @@ def reachable(folder: Path) -> Iterator[None]:
 
 
 def find_file(folder: Path, name: str) -> Path:
-    """Return the path of a file, whose name on disk may differ as the names of `same_name` do.
-
-    Args:
-        folder: the folder.
-        name: relative to the folder; it need not exist.
-    """
+    """Return the path of a folder's file, which need not exist; `same_name` compares its name."""
     path = folder
     for part in PurePosixPath(name).parts:
         if not (path / part).exists() and path.is_dir():
@@ -164,25 +149,15 @@ def find_file(folder: Path, name: str) -> Path:
 
 
 def same_name(name: str) -> str:
-    """Return the form in which names of files are compared.
-
-    Cameras write endings in capitals, and macOS writes letters and their accents apart.
-    """
+    """Return the form to compare file names in: cameras write capitals, macOS splits accents."""
     composed = PurePosixPath(unicodedata.normalize("NFC", name))
     return composed.stem + composed.suffix.lower()
 
 
 def existing_file(folder: Path, name: str, where: str, *, folders: bool = False) -> Path:
-    """Return the path of an existing file in the folder.
+    """Return the path of an existing file, or of `folders` that are not empty, in the match folder.
 
-    Args:
-        folder: the match folder.
-        name: relative to the folder.
-        where: source of the name, for messages.
-        folders: also accept a folder that is not empty.
-
-    Raises:
-        InputError: there is no such file, or it is outside.
+    InputError, with `where` its name is from, if it is absent or outside.
     """
     require_local(name, where)
     try:
@@ -214,19 +189,11 @@ def files_by_unit(
     *,
     alone: bool = False,
 ) -> dict[str, Path]:
-    """Return the files of a subfolder of a match folder by unit, without hidden ones.
+    """Return the files of a subfolder `place`, which need not exist, by unit, without hidden ones.
 
-    Args:
-        folder: the match folder.
-        place: the subfolder, which need not exist.
-        suffixes: endings of the files, in small letters.
-        known: the units that may have a file.
-        units: what these units are, for messages.
-        alone: whether files with other endings are refused, not ignored.
-
-    Raises:
-        InputError: a file belongs to no such unit, or two belong to one; it leads out of the
-            folder.
+    `suffixes` are in small letters; files with others are ignored, or refused if `alone`.
+    InputError, which calls the `known` ones `units`, if a file belongs to none or leads out of the
+    match folder, or two belong to one.
     """
     found: dict[str, Path] = {}
     for file in sorted((folder / place).glob("[!.]*")):

@@ -75,8 +75,7 @@ def write_match(
         further: called with the temporary match folder, to add videos and `reference/`.
 
     Raises:
-        InputError: the folder exists and is not empty, its disk is full, or the arguments
-            contradict each other.
+        InputError: the folder is not empty, its disk is full, or the arguments contradict.
     """
     annotations = annotations or MatchAnnotations()
     clicked, key_frames = annotations.clicked, annotations.key_frames
@@ -222,16 +221,11 @@ def write_offsets(folder: Path, offsets: Mapping[str, ClockOffset]) -> None:
 
 
 def import_boxes(boxes: Path, folder: Path, notes: list[str] | None = None) -> dict[str, int]:
-    """Copy boxes of people into a match folder; return the number of each camera or clip.
+    """Copy boxes of people into a match folder with videos; return the number by camera or clip.
 
-    Args:
-        boxes: folder with `<camera>.txt` or `<clip>.txt` (`read_boxes`).
-        folder: the match folder, with the videos.
-        notes: receives sentences about boxes that are left out or changed.
-
-    Raises:
-        InputError: a file is invalid, its camera has no video, or has 2D poses or boxes already;
-            nothing is written then.
+    `boxes` has `<camera>.txt` or `<clip>.txt` (`read_boxes`), and `notes` receive sentences about
+    boxes that are left out or changed. InputError if a camera has no video, or has 2D poses or
+    boxes already; nothing is written then.
     """
     match = read_match(folder, whose=None)
     open_to = {name for name in match.videos if name not in match.detections}
@@ -257,14 +251,8 @@ def copy_boxes(
 ) -> dict[str, int]:
     """Check all files of boxes against the videos, then copy them; return their numbers.
 
-    Args:
-        boxes: folder with a file of boxes for some of the cameras.
-        indices: frames of the video of each camera that may have boxes.
-        folder: the match folder.
-        notes: as in `import_boxes`.
-
-    Raises:
-        InputError: there are no files, one of an unknown camera, or an invalid one.
+    `boxes` has a file for some of the cameras, and `indices` has the frames of the video of those
+    that may have one; `notes` are as in `import_boxes`. InputError also for no files.
     """
     files = _box_files(boxes)
     names = [known_id(file.stem, indices) for file in files]

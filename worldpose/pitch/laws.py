@@ -111,12 +111,7 @@ def _spread(name: str) -> Iterator[tuple[float, float, Callable[[str], str]]]:
 
 
 def prescribed_markings(spec: PitchSpec, size: tuple[float, float] | None = None) -> Markings:
-    """Return the markings of a pitch's template.
-
-    Args:
-        spec: template, dimensions, and length and width.
-        size: another length and width [m].
-    """
+    """Return the markings of a pitch's template, at the length and width of the spec, or [m]."""
     sizes = spec.sizes
     found = Markings()
     size = size or (spec.length, spec.width)

@@ -45,7 +45,6 @@ class Survey:
         where: the file, for messages.
         names: names of the pitch template's points, each once.
         places: (n, 3) [m]; z is up, NaN without a height.
-        template: the game whose markings they are.
     """
 
     where: str
@@ -64,11 +63,9 @@ def read_survey(path: Path, template: TemplateName = "football") -> Survey:
 
     A name is a point of the pitch template, or an end of a line as `<line>.start` or `<line>.end`.
     `easting`, `northing` and `height` or `elevation` may replace x, y and z, and `point` name; a
-    unit `(m)` or `[m]` may follow. `read_cells` says how the text may be saved.
-
-    Raises:
-        InputError: the error names file and row: the file is unreadable, or has a missing or
-            unknown column, an unknown or repeated name, or text that is no number.
+    unit `(m)` or `[m]` may follow. `read_cells` says how the text may be saved. InputError names
+    file and row of a missing or unknown column, an unknown or repeated name, or text that is no
+    number.
     """
     most = 1 << 20  # all named points take 3 kB
     rows, has_commas = read_cells(path, most, "Correct the survey file.")
@@ -270,13 +267,8 @@ def fit_survey(survey: Survey, settings: SurveySettings | None = None) -> Survey
     only with `fit_scale`. Length, width and crown are fitted by least squares; values that the
     survey does not determine stay near those of the template.
 
-    Args:
-        survey: named positions.
-        settings: the defaults if None.
-
-    Raises:
-        InputError: fewer than four points, or all near one line; another unit than metres; a
-            mirror image; points far from the positions of their names.
+    InputError for fewer than four points, or all near one line; another unit than metres; a mirror
+    image; points far from the positions of their names.
     """
     settings = settings or SurveySettings()
     _require_spread(survey)

@@ -300,10 +300,7 @@ class PitchTemplate:
 def surface_shape(x: ArrayLike, y: ArrayLike, size: tuple[float, float]) -> Floats:
     """Return the derivatives (..., 2) of the surface's height by crown and end fall [m/m].
 
-    Args:
-        x: (...) [m], world.
-        y: (...) [m], world, of the same shape.
-        size: length, width of the pitch [m].
+    Places x, y (...) [m] are in the world; `size` is length, width of the pitch [m].
     """
     along = np.asarray(x, dtype=np.float64) / (0.5 * size[0])
     across = np.asarray(y, dtype=np.float64) / (0.5 * size[1])
@@ -465,8 +462,7 @@ class Surface:
 
     The Laws say nothing about slopes. Builders let a pitch fall by 0.5 to 1 % from the center spot,
     to the touch lines or to all sides, so that it drains. Where a survey has heights, they tell the
-    shape; otherwise painted lines in the images of static cameras do, and all cameras of a venue
-    see the same surface.
+    shape; otherwise painted lines in the images of a venue's static cameras do, for all together.
 
     Attributes:
         shape: (2,) crown: height of the long axis above the touch lines; end fall: height of the

@@ -9,11 +9,7 @@ from worldpose.errors import InputError
 
 
 def require_torch() -> None:
-    """Check that torch is installed.
-
-    Raises:
-        InputError: it is not.
-    """
+    """Raise InputError if torch is not installed."""
     try:
         import torch  # noqa: F401
     except ImportError as error:

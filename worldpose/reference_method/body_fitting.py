@@ -77,11 +77,9 @@ def fit_shape(body: DifferentiableBody, joints: Floats) -> Floats:
 def align_root(body: DifferentiableBody, start: Omega, joints: Floats) -> Omega:
     """Return Omega whose hips and torso are nearest to P's, where only theta_r and t move.
 
-    Args:
-        body: with the keypoints of COCO-17.
-        start: theta_b and beta; theta_r and t are 0.
-        joints: (frames, 17, 3) P [m], world. A frame with fewer than three of these keypoints takes
-            the root of the nearest frame with them; one frame has them at least.
+    The body has the keypoints of COCO-17; `start` has theta_b and beta, and theta_r and t of 0. P
+    are (frames, 17, 3) [m], world. A frame with fewer than three of these keypoints takes the root
+    of the nearest frame with them; one frame has them at least.
     """
     torso = joints[:, COCO17_TORSO]
     usable = np.flatnonzero(np.isfinite(torso[..., 0]).sum(-1) >= 3)
@@ -99,12 +97,8 @@ def align_keypoints(cameras: TensorCameras, image: Tensor, joints: Tensor) -> Te
     """Return p - p_midhip + Pi(P_midhip) (frames, cameras, 17, 2) [px].
 
     "We align the projected 2D keypoint with the hip to minimize errors introduced by a misaligned
-    root", as the supplement writes it for triangulation.
-
-    Args:
-        cameras: (cameras,).
-        image: (frames, cameras, 17, 2) p [px]; NaN where not seen.
-        joints: (frames, 17, 3) P, triangulated [m], world; NaN where missing.
+    root", as the supplement writes it for triangulation. p are (frames, cameras, 17, 2) [px], NaN
+    where not seen, P (frames, 17, 3), triangulated [m], world, NaN where missing.
     """
     middle = cameras.project(joints[:, COCO17_HIPS].mean(1)[:, None])
     return image - image[:, :, COCO17_HIPS].mean(2, keepdim=True) + middle[:, :, None]
@@ -155,13 +149,9 @@ def fit_person(
 ) -> Omega:
     """Return Omega after shape, root alignment and E_refine, by L-BFGS as in SMPLify-X.
 
-    Args:
-        body: with the keypoints of COCO-17.
-        joints: (frames, 17, 3) P [m], world; three of hips and shoulders in one frame at least.
-        cameras: static cameras.
-        image: (frames, cameras, 17, 2) [px]; NaN where not seen.
-        betas: (shapes,), if the shape is known; then it stays.
-        iterations: maximum iterations of L-BFGS.
+    The body has the keypoints of COCO-17. P are (frames, 17, 3) [m], world, three of hips and
+    shoulders in one frame at least; images (frames, cameras, 17, 2) [px] are NaN where not seen.
+    Betas (shapes,) stay if the shape is known; L-BFGS has so many iterations at most.
     """
     shape = torch.tensor(fit_shape(body, joints) if betas is None else betas)
     still = (torch.zeros(len(joints), n, dtype=torch.float64) for n in (3, 69, 3))

@@ -21,11 +21,8 @@ def robust(off: Tensor) -> Tensor:
 def energy(cameras: TensorCameras, points: Tensor, image: Tensor, frame: Tensor) -> Tensor:
     """Return sum rho(Pi(X; Lambda_b) - x): E_field of markings, E_player of matched keypoints.
 
-    Args:
-        cameras: (frames,) Lambda_b.
-        points: (n, 3) X' of markings, or P of people with I_ij = 1 [m], world.
-        image: (n, 2) [px], their detections; of markings their initial positions.
-        frame: (n,)
+    Lambda_b is (frames,). X (n, 3) [m], world, are X' of markings, or P of people with I_ij = 1; x
+    (n, 2) [px] their detections in frames (n,), of markings their initial positions.
     """
     return robust(cameras.project(points, frame) - image).sum()
 
@@ -41,11 +38,8 @@ def refine(
     R, f and k1 to k3 are free in each frame, and the centre C in the clip. The principal point is
     one for the clip, as our records hold it; the paper has one per frame.
 
-    Args:
-        start: (frames,) batch with one centre.
-        field: points (n, 3) [m], world, pixels (n, 2) and frames (n,) of the markings.
-        players: the same of people's keypoints.
-        iterations: number of steps.
+    `start` is a batch (frames,) with one centre. `field` has points (n, 3) [m], world, pixels (n,
+    2) and frames (n,) of the markings, `players` the same of people's keypoints.
     """
     cameras = TensorCameras.of(start)
     bounds = ((0, 3), (3, 6), (6, 7), (7, 9), (9, 12))

@@ -46,8 +46,7 @@ class TensorCameras:
     def of(cls, camera: Camera) -> TensorCameras:
         """Return a batch (cameras,) as tensors; NaN where a camera is missing.
 
-        Raises:
-            InputError: a lens has more than k1, k2 and k3.
+        InputError if a lens has more than k1, k2 and k3.
         """
         require_radial(camera)
         parts = [
@@ -103,19 +102,13 @@ def require_radial(camera: Camera) -> None:
 
 
 def project(points: Tensor, values: Tensor, rotation: Tensor, aspect: Tensor) -> Tensor:
-    """Return Pi(X; Lambda), the perspective projection with radial distortion.
+    """Return Pi(X; Lambda) (..., 2) [px], the perspective projection with radial distortion.
 
-    x_cam = R (X - C); (x, y) = x_cam / z; s = x^2 + y^2; pixel = f (1 + k1 s + k2 s^2 + k3 s^3)
-    (x, y) + c. Section "Static Camera Calibration", Stage 2, and section "Notations".
+    x_cam = R (X - C); (x, y) = x_cam / z; s = x^2 + y^2; pixel = f (1 + k1 s + k2 s^2 + k3 s^3) (x,
+    y) + c. Section "Static Camera Calibration", Stage 2, and section "Notations".
 
-    Args:
-        points: (..., 3) [m], world.
-        values: (..., 12), see `PARAMETERS`.
-        rotation: (..., 3, 3), at the start.
-        aspect: (...).
-
-    Returns:
-        (..., 2) [px]; NaN behind the camera.
+    X are (..., 3) [m], world, Lambda (..., 12) of `PARAMETERS`; the rotation (..., 3, 3) is that at
+    the start, the aspect (...). Behind the camera, pixels are NaN.
     """
     turned = rotation_matrices(values[..., :3]) @ rotation
     local = (turned @ (points - values[..., 3:6])[..., None])[..., 0]

@@ -14,13 +14,9 @@ def triangulate(
 ) -> Tensor:
     """Return X* = arg min over X of the sum over cameras of ||Pi(X; Lambda_c) - x_c||^2 [m].
 
-    Section "Human 3D Pose Estimation and Tracking": all views of a joint count alike.
-
-    Args:
-        cameras: (cameras,).
-        image: (points, cameras, 2) [px]; NaN where a point is not seen.
-        start: (points, 3) [m], world; NaN stays NaN.
-        iterations: number of Gauss-Newton steps; a point takes those that lower its error.
+    Section "Human 3D Pose Estimation and Tracking": all views of a joint count alike. Images are
+    (points, cameras, 2) [px], NaN where a point is not seen; starts (points, 3) [m], world, stay
+    NaN. A point takes those of the Gauss-Newton steps that lower its error.
     """
 
     def residuals(point: Tensor, pixels: Tensor) -> Tensor:

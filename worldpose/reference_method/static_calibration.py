@@ -108,12 +108,8 @@ def distance_map(picture: Image, camera: Camera, points: Floats) -> NDArray[np.f
     """Return D (height, width), the distance to the nearest pixel of a line [px] (Stage 3).
 
     Supplement, "Static Camera Calibration": line pixels are Canny edges near the markings that the
-    previous stage projects.
-
-    Args:
-        picture: (height, width) or (height, width, 3).
-        camera: of stage 2.
-        points: (n, 3) [m], world, along the markings.
+    previous stage projects, of points (n, 3) [m], world, along them. The picture is (height, width)
+    or (height, width, 3).
     """
     grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     edges = cv2.Canny(cv2.GaussianBlur(grey, (0, 0), 1.0), 40, 100)
@@ -189,15 +185,9 @@ def calibrate(
 ) -> StaticCalibration:
     """Return a calibration whose camera is that of stages 1 and 2, and with a picture of stage 3.
 
-    Args:
-        known: our calibration; clicks that it excludes count as corrected by hand. Covariance,
-            expected ground error and warnings remain those of our fit: the paper has none.
-        pitch: the template.
-        picture: (height, width) or (height, width, 3).
-        start: replaces stage 1.
-
-    Raises:
-        InputError: the clicks determine no camera.
+    Clicks that our calibration excludes count as corrected by hand. Covariance, expected ground
+    error and warnings remain those of our fit: the paper has none. The picture is (height, width)
+    or (height, width, 3); `start` replaces stage 1. InputError if the clicks determine no camera.
     """
     clicks = [point for point in known.report.points if point.inlier]
     points = pitch.positions([point.name for point in clicks])

@@ -190,10 +190,7 @@ def plot_stadium(
 
 
 def visible_ground(camera: Camera) -> Floats:
-    """Return corners (n, 2) [m] of the ground in a camera's field of view, to 130 m.
-
-    The ground is the plane z = 0, world.
-    """
+    """Return corners (n, 2) [m], z = 0, of the ground in a camera's field of view, to 130 m."""
     width, height = (float(n) for n in camera.image_size)
     share = np.linspace(0.0, 1.0, 25)[:-1]
     corners = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]]) - 0.5

@@ -22,10 +22,7 @@ def data_set_page(
     checks: Mapping[str, CheckReport],
     manifest: DataSetManifest | None = None,
 ) -> str:
-    """Return a self-contained HTML page of statistics, and of findings of the check per folder.
-
-    A manifest adds composition, subjects and licences: the page is then the data set's datasheet.
-    """
+    """Return an HTML page of statistics and findings; with a manifest it is the datasheet."""
     people = "-" if found.subjects_per_frame is None else f"{found.subjects_per_frame:.1f}"
     wrong = sum(len(report.findings) for report in checks.values())
     tiles = [

@@ -167,10 +167,7 @@ def picture_panels(
 
 
 class _FittedImage(AxesImage):
-    """An image of the size at which a PNG shows it, which is copied there.
-
-    Matplotlib would convert it to floating point and resample it, which takes 0.2 s.
-    """
+    """An image of the size at which a PNG shows it: Matplotlib's conversion would take 0.2 s."""
 
     def make_image(
         self,
@@ -287,10 +284,7 @@ def keep_figures() -> Iterator[dict[bytes, Figure]]:
 
 
 def write_figure(figure: Figure, stem: Path, caption: str) -> list[Path]:
-    """Write a figure as `stem.svg` and `stem.pdf`, and what it shows as `stem.json`.
-
-    Equal figures have equal files. Text stays text, which drawing programs can change.
-    """
+    """Write a figure as `stem.svg`, `stem.pdf` and data `stem.json`; equal ones as equal files."""
     written = [stem.with_name(f"{stem.name}{suffix}") for suffix in (".svg", ".pdf", ".json")]
     with rc_context({"svg.hashsalt": "worldpose", "svg.fonttype": "none", "pdf.fonttype": 42}):
         for path, dated in zip(written[:2], ("Date", "CreationDate"), strict=True):

@@ -18,12 +18,7 @@ from typing import TypeAlias
 
 @dataclass(frozen=True)
 class EmbeddedPage:
-    """A whole HTML page that is shown in a frame of its own, such as the 3D viewer with clips.
-
-    Attributes:
-        title: names the frame to screen readers.
-        html: the page; its scripts are modules and stand inside.
-    """
+    """A whole HTML page in a frame of its own, such as the 3D viewer with clips."""
 
     title: str
     html: str
@@ -31,12 +26,7 @@ class EmbeddedPage:
 
 @dataclass(frozen=True)
 class LinkedFile:
-    """A file beside the page, which a reader opens by a link.
-
-    Attributes:
-        title: text of the link.
-        name: name of the file, in the folder of the page.
-    """
+    """A file in the folder of the page, which a reader opens by a link with a title as its text."""
 
     title: str
     name: str
@@ -52,13 +42,7 @@ class CaptionedImage:
 
 @dataclass(frozen=True)
 class Table:
-    """A table with a heading.
-
-    Attributes:
-        heading: title of the table.
-        columns: titles; the prefix ">" marks numeric columns.
-        rows: rows of text.
-    """
+    """A table with a heading and rows of text; the prefix ">" of columns marks numeric ones."""
 
     heading: str
     columns: tuple[str, ...]
@@ -67,13 +51,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Section:
-    """A section of the page with a link in its navigation bar.
-
-    Attributes:
-        heading: also in the navigation bar.
-        blocks: blocks in this order.
-        lead: introduction.
-    """
+    """A section of the page with a link in its navigation bar, a lead, and blocks in order."""
 
     heading: str
     blocks: tuple[CaptionedImage | Table | EmbeddedPage | LinkedFile, ...]
@@ -86,12 +64,7 @@ class Failure(str):
 
 @dataclass(frozen=True)
 class Folded:
-    """Collapsible tables at the end of a page; all but the first are folded.
-
-    Attributes:
-        heading: also in the navigation bar.
-        tables: tables without rows are left out.
-    """
+    """Collapsible tables at the end of a page, without empty ones; all but the first are folded."""
 
     heading: str
     tables: tuple[Table, ...]
@@ -105,10 +78,7 @@ def whole_page(
     tiles: Sequence[tuple[str, str]] = (),
     last: Folded | None = None,
 ) -> str:
-    """Return a whole HTML page, without the sections that have no blocks.
-
-    Tiles are key metrics at the top, each with its label.
-    """
+    """Return a whole HTML page, without empty sections, and with key metrics as tiles."""
     shown = [section for section in sections if section.blocks]
     allowed = " ".join(dict.fromkeys(_allowed_scripts(shown)))
     policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"

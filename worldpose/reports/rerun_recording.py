@@ -28,12 +28,9 @@ def write_recording(
 ) -> None:
     """Write a recording (.rrd) atomically, with timelines `frame` and `time`.
 
-    In the image of each static camera, the markings are where its lens shows them.
-
-    Cameras are single, or one per frame of the tracks, NaN where missing.
-
-    Raises:
-        UsageError: rerun-sdk is not installed.
+    In the image of each static camera, the markings are where its lens shows them. Cameras are
+    single, or one per frame of the tracks, NaN where missing. UsageError if rerun-sdk is not
+    installed.
     """
     white = (235, 235, 235)
     try:

@@ -43,10 +43,7 @@ class Click(NamedTuple):
 
 
 class ErrorMap(NamedTuple):
-    """Expected ground error (rows, columns) at x (columns,) and y (rows,) of the world [m].
-
-    NaN outside the field of view.
-    """
+    """Expected ground error (rows, columns) at x (columns,), y (rows,) [m]; NaN out of view."""
 
     x: Floats
     y: Floats

@@ -28,13 +28,7 @@ Picture = tuple[str, int | None]
 
 @dataclass(frozen=True)
 class Replay:
-    """A match folder with corrections applied; its files are unchanged.
-
-    Attributes:
-        folder: match folder with the corrected clicks.
-        applied: the applied corrections, in the order they were made.
-        stale: the corrections that no longer apply, each with the reason.
-    """
+    """A match folder with corrections applied in order, and the `stale` ones, with reasons."""
 
     folder: MatchFolder
     applied: tuple[Correction, ...] = ()

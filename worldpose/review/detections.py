@@ -26,12 +26,7 @@ rounded values."""
 
 @dataclass(frozen=True, eq=False)
 class DetectionReplay:
-    """Detections of one camera with corrections applied.
-
-    Attributes:
-        observations: detections with corrections.
-        objections: per edit the reason why it does not apply; None if it does.
-    """
+    """Detections of one camera with corrections; per edit, why it does not apply, or None."""
 
     observations: KeypointDetections
     objections: tuple[str | None, ...]
@@ -130,12 +125,9 @@ def _row(found: KeypointDetections, frame: int) -> int | None:
 
 @dataclass(frozen=True)
 class Changes:
-    """Changes of an annotator.
+    """Changes of an annotator in a file of `pictures`: edits in the order of application.
 
-    Attributes:
-        edits: edits in the order of application.
-        pictures: number of images in the annotator's file.
-        boxes: number of changed boxes of existing people: corrections cannot express these.
+    `boxes` is the number of changed boxes of existing people: corrections cannot express these.
     """
 
     edits: tuple[DetectionEdit, ...]

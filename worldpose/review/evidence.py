@@ -54,11 +54,8 @@ def open_detections(
 ) -> OpenDetections:
     """Return the detections of one camera's result that await review.
 
-    Args:
-        frame: (frames,) match frames, rising without gaps.
-        score: (frames, detections) without corrections; NaN = no detection.
-        acceptances: acceptances of this result.
-        edits: edits of this camera; a corrected detection counts as reviewed.
+    Match frames (frames,) rise without gaps; scores (frames, detections) are without corrections,
+    NaN = no detection. Acceptances are of this result; a corrected detection counts as reviewed.
     """
     there = np.isfinite(score)
     waits = there.copy()
@@ -86,12 +83,7 @@ def open_detections(
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """One metric over a clip's frames.
-
-    Attributes:
-        title: name with unit.
-        values: (frames,); NaN where undefined.
-    """
+    """One metric over a clip's frames: a title with unit, values (frames,), NaN where undefined."""
 
     title: str
     values: Floats
@@ -102,12 +94,9 @@ def clip_curves(
 ) -> tuple[Curve, ...]:
     """Return the number of people and their uncertainty per frame.
 
-    Args:
-        bodies: (frames, persons, 17, 3) keypoints of the fitted bodies [m], world; NaN = no body.
-        covariance: (frames, persons, 17, 3, 3) covariance of these keypoints [m^2].
-        filled: (frames, persons) bodies from the motion model alone.
-        placed: (frames, persons, 17, 3) triangulated joints [m] of the same people; NaN where
-            missing.
+    Keypoints (frames, persons, 17, 3) of bodies [m], world, NaN = no body, have a covariance
+    (frames, persons, 17, 3, 3) [m^2]; `filled` (frames, persons) are from the motion model alone.
+    `placed` are triangulated joints of the same shape [m], NaN where missing.
     """
     there = np.isfinite(bodies).all(axis=-1)
     people = there.any(axis=-1)
@@ -154,15 +143,11 @@ class ViewCheck:
 
 
 def epipolar_curves(source: Camera, target: Camera, pixel: ArrayLike) -> list[Floats]:
-    """Return the epipolar curves in `target` of a pixel in `source`.
+    """Return the epipolar curves in `target` of a pixel (2,) [px] in `source`, single cameras.
 
     The function projects the part of the pixel's ray where joints can be into the other image, with
-    lens distortion, and clips it to the image.
-
-    Both are single cameras; the pixel (2,) [px] is one of `source`.
-
-    Returns:
-        Polylines (n, 2) [px] within the image of `target`; none if the ray is not visible.
+    lens distortion, and clips it to the image. They are polylines (n, 2) [px]; none if the ray is
+    not visible.
     """
     edge_halvings = 12  # bisections to the border of the image: 12 px become 0.003 px
     halvings = 8  # maximum number of subdivisions
@@ -211,13 +196,10 @@ def epipolar_curves(source: Camera, target: Camera, pixel: ArrayLike) -> list[Fl
 
 
 def check_views(cameras: Camera, keypoints: ArrayLike) -> ViewCheck:
-    """Return the multi-view consistency of one person in one frame.
+    """Return the multi-view consistency of one person in one frame of cameras (cameras,).
 
     A joint is the nearest point to its rays, with weights from the size of a pixel at its distance.
-
-    Args:
-        cameras: a batch (cameras,).
-        keypoints: (cameras, joints, 2) [px]; NaN where not seen.
+    Keypoints are (cameras, joints, 2) [px]; NaN where not seen.
     """
     places = np.asarray(keypoints, dtype=np.float64)
     rays = cameras.unproject(places)
@@ -264,11 +246,7 @@ def _span(rays: Rays) -> tuple[float, float] | None:
 
 @dataclass(frozen=True, eq=False)
 class PitchDrawing:
-    """A pitch with cached sample points for repeated drawing.
-
-    Attributes:
-        template: the stadium's template.
-    """
+    """A pitch, the stadium's template, with cached sample points for repeated drawing."""
 
     template: PitchTemplate
 
@@ -310,13 +288,9 @@ class PitchDrawing:
 
 @dataclass(frozen=True, eq=False)
 class Preview:
-    """Camera, report and projected pitch from the current clicks.
+    """Camera, its report, and the pitch projected from the current clicks.
 
-    Attributes:
-        camera: the camera.
-        report: its accuracy and warnings.
-        markings: polylines (n, 2) [px] by name.
-        points: projections of the named points (2,) [px], by name.
+    Markings are polylines (n, 2) [px], points (2,) [px], by name.
     """
 
     camera: Camera
@@ -338,10 +312,8 @@ def preview(
     """Return the camera from the current clicks, and the projected pitch.
 
     With the image (height, width, 3), the calibration refines the camera on the painted lines,
-    which takes seconds and not milliseconds.
-
-    Raises:
-        InputError: the clicks do not determine a camera; the message says which clicks to add.
+    which takes seconds and not milliseconds. InputError says which clicks to add if they do not
+    determine a camera.
     """
     found = calibrate_camera(
         drawing.template,

@@ -79,12 +79,7 @@ class Identities:
 
 @dataclass(frozen=True, eq=False)
 class IdentityReplay:
-    """Identities with corrections applied.
-
-    Attributes:
-        identities: identities with corrections.
-        objections: per edit the reason why it does not apply; None if it does.
-    """
+    """Identities with corrections applied; per edit, why it does not apply, or None."""
 
     identities: Identities
     objections: tuple[str | None, ...]
@@ -140,11 +135,9 @@ def add_plane_tracks(
 ) -> Identities:
     """Add people on the plane, and the frames in which the feet place triangulated people.
 
-    Args:
-        found: triangulated people.
-        detection_index: (frames, cameras, tracks), as in `Identities`, of tracks by feet.
-        is_placed: (frames, tracks), whether the track has a place.
-        continues: (tracks,) index in `found.person` of the triangulated person; -1 = none.
+    Tracks by feet have detections (frames, cameras, tracks) as in `Identities`, and a place in some
+    frames (frames, tracks). Each continues a triangulated person, index in `found.person`, -1 =
+    none.
     """
     index, on_plane = found.detection_index.copy(), found.on_plane.copy()
     for n in np.flatnonzero(continues >= 0):
@@ -228,10 +221,7 @@ def _called(found: Identities, person: int) -> str:
 
 
 def find_sighting(found: Identities, person: int, first: int = 0) -> Sighting | None:
-    """Return a person's detection with the smallest ray distance from match frame `first` on.
-
-    None without detections.
-    """
+    """Return a person's detection of smallest ray distance from match frame `first` on, or None."""
     k = found.person.tolist().index(person)
     seen = (found.detection_index[:, :, k] >= 0) & (found.frame >= first)[:, None]
     if not seen.any():

@@ -101,11 +101,8 @@ def read_journal(store: Store, match_id: str) -> Journal:
     ignores it and lists it in `damage`.
 
     The function caches per store object: if the last entry is unchanged, it reads only newer ones.
-    Only `verify` and the next process detect later damage to earlier entries.
-
-    Raises:
-        CorruptionError: an entry with a successor is damaged or missing.
-        InputError: an entry has another contract version.
+    Only `verify` and the next process detect later damage to earlier entries. CorruptionError if an
+    entry with a successor is damaged or missing, InputError if one has another contract version.
     """
     folder = f"reviews/{checked_name(match_id)}"
     with _KNOWN_LOCK:
@@ -133,12 +130,9 @@ def read_journal(store: Store, match_id: str) -> Journal:
 
 @dataclass
 class _Known:
-    """Cached journal of a store object.
+    """Cached journal of a store object, None before the first read, with its last entry's bytes.
 
-    Attributes:
-        journal: None before the first read.
-        last_data: the bytes of its last entry, None without entries.
-        lock: held by the reading thread.
+    The reading thread holds the lock.
     """
 
     journal: Journal | None = None
@@ -238,12 +232,9 @@ def requests_by_id(records: Iterable[ReviewRecord]) -> dict[str, ReviewRequest]:
 def last_decision(
     records: Iterable[ReviewRecord], unit: str, content: str
 ) -> ReviewDecision | None:
-    """Return the last verdict on a result's bytes, None without a decision.
+    """Return the last verdict on a result's bytes in records in order, None without a decision.
 
-    Args:
-        records: records of the journal, in order.
-        unit: unit as `stage/unit`.
-        content: digest of the result's files; its key may differ from that at the decision.
+    The unit is `stage/unit`, the content a digest of the result's files; its key may have changed.
     """
     about: set[str] = set()
     last = None

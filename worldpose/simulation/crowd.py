@@ -186,10 +186,7 @@ class Crowd:
     away: Floats
 
     def joints(self, times: Floats) -> Floats:
-        """Return joints (frames, persons, 17, 3) [m], world, at `times` [s]; repeatable.
-
-        NaN while a person is away.
-        """
+        """Return joints (frames, persons, 17, 3) [m], world, at `times` [s]; NaN while away."""
         joints = np.empty((len(times), len(self.paths), 17, 3))
         for person in range(len(self.paths)):
             joints[:, person] = self._solve_person(person, times).keypoints()

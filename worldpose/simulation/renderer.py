@@ -244,10 +244,7 @@ def _haze_before(venue: Venue, outline: Singles) -> Singles:
 
 
 def cluster_boxes(spans: Sequence[Box | None]) -> list[tuple[Box, list[int]]]:
-    """Return image regions that share no pixel, each with the indices of the things in it.
-
-    Spans are left, top, right, bottom of each thing; None for a thing outside the image.
-    """
+    """Return regions that share no pixel, each with the indices of the things in its box."""
     parts: list[tuple[Box, list[int]]] = []
     for number, span in enumerate(spans):
         if span is None:

@@ -25,9 +25,8 @@ class Board:
     """A flat calibration board.
 
     Attributes:
-        columns: inner corners along one side; squares for a ChArUco board [1].
-        rows: the same along the other side [1].
-        square_m: side of a square [m].
+        columns: inner corners along one side; squares for a ChArUco board [1]; rows: the other
+            side.
         dictionary: ArUco dictionary of a ChArUco board, such as `DICT_4X4_50`; None = checkerboard.
         marker_m: side of its markers [m].
     """
@@ -76,10 +75,7 @@ class Board:
         return BoardView(places.astype(np.float64), pixels, note)
 
     def others(self, image: Image) -> Iterator[tuple[Board, str]]:
-        """Yield boards that are perhaps meant, each with a sentence about the difference.
-
-        No board was found in the image (height, width[, 3]).
-        """
+        """Yield boards that are perhaps meant, if an image shows none, each with the difference."""
         given = f"{self.columns} x {self.rows}"
         if self.dictionary is None:
             if min(self.columns, self.rows) > 3:
@@ -207,18 +203,15 @@ class LensFit:
 def calibrate_lens(
     camera: str, views: Sequence[BoardView | None], size: tuple[int, int]
 ) -> LensFit:
-    """Return the lens of a camera from images of one board.
+    """Return the lens of a camera from images of one board; InputError if they do not determine it.
 
-    Focal length (square pixels), principal point, k1, k2, p1 and p2 are estimated by OpenCV
-    (Zhang, 2000); or k1 to k4 of a fisheye, if its residuals are clearly smaller. Images whose
-    corners are not on a plane, or that contradict the others, are left out. The standard deviations
-    are those of leaving out one image at a time (jackknife). If the board is bent, which all images
-    share, they are larger by what the bend moves the lens.
+    Focal length (square pixels), principal point, k1, k2, p1 and p2 are estimated by OpenCV (Zhang,
+    2000); or k1 to k4 of a fisheye, if its residuals are clearly smaller. Images whose corners are
+    not on a plane, or that contradict the others, are left out. The standard deviations are those
+    of leaving out one image at a time (jackknife). If the board is bent, which all images share,
+    they are larger by what the bend moves the lens.
 
     `views` has None where no board was found; `size` is the width and height of all images [px].
-
-    Raises:
-        InputError: too few images with a board, or the boards do not determine the focal length.
     """
     min_std_px = 0.1  # of focal length and principal point
     max_focal_std = 0.05  # relative; boards that all face the camera do not determine it

@@ -43,11 +43,9 @@ class InlierFit:
         inliers: (n,) bool.
         markings: (m,) bool, inliers among the drawn markings.
         mahalanobis: (n,) distance of each click from its prediction by the other evidence.
-        noise_scale: estimated noise over the stated noise: 1 unless the residuals clearly
-            contradict the stated noise.
-        click_noise: standard deviation of the inlying clicks, estimated from their residuals [px];
-            NaN without degrees of freedom.
-        click_freedom: degrees of freedom of that estimate [1].
+        noise_scale: estimated noise over the stated noise: 1 unless residuals clearly contradict.
+        click_noise: standard deviation of the inlying clicks, from their residuals [px]; NaN
+            without `click_freedom`, the degrees of freedom of that estimate [1].
         misfit: mean loss per observation in the stated noise [1]; about 1 without gross errors.
     """
 
@@ -74,7 +72,6 @@ class Explanation:
 
     Attributes:
         problem: the clicks, at the noise of the explanation.
-        fit: fit to the inliers.
         settings: settings at this noise.
         assumptions: further assumptions, in words.
     """
@@ -105,10 +102,7 @@ def fit_inliers(
     noise for the test of a click comes from the other clicks: the stated noise, unless their
     residuals clearly contradict it. A click on a point that the camera cannot image is always an
     outlier. A drawn marking is an outlier if half of it has a large residual: it has the wrong
-    name.
-
-    Raises:
-        InputError: only an impossible camera explains the clicks.
+    name. InputError if only an impossible camera explains the clicks.
     """
     limit = settings.wrong_click
     count = len(problem.evidence.points)
@@ -150,10 +144,7 @@ def fit_inliers_at_best_noise(
     A few clicks with large residuals are outliers at the stated noise, or inliers at a larger
     noise. The larger posterior probability decides: inliers are Gaussian, outliers are uniform in
     the image, and the prior of the noise is centered on the stated noise, which stands unless
-    another noise is clearly more probable.
-
-    Raises:
-        InputError: only an impossible camera explains the clicks.
+    another noise is clearly more probable. InputError as of `fit_inliers`.
     """
     fit = fit_inliers(problem, start, settings)
     best = Explanation(problem.with_survey_error(fit.row, settings), fit, settings)
@@ -197,8 +188,8 @@ def negative_log_posterior(
     """Return minus twice the log posterior of an explanation, up to a constant.
 
     Comparisons of assumptions about the camera include the camera prior; in comparisons of noise it
-    would count a lens that is rare under the prior as noise. The factor is the noise over the
-    stated one. The scale is that of the fit, if None.
+    would count a lens that is rare under the prior as noise. `factor` is the noise over the stated
+    one; `noise_scale` None is that of the fit.
     """
     log_two_pi = float(np.log(2.0 * np.pi))
     problem, fit, settings = found.problem, found.fit, found.settings
@@ -357,8 +348,7 @@ class _Noise:
     Attributes:
         scale: estimated noise over the stated noise.
         worth: degrees of freedom of the scale; infinite for the stated noise.
-        squared: sum of squared residuals in the stated noise.
-        freedom: degrees of freedom of that sum.
+        squared: sum of squared residuals in the stated noise, with `freedom` degrees of freedom.
     """
 
     scale: float

@@ -189,7 +189,6 @@ class _Reached:
     """A camera and a surface on the way to the best ones.
 
     Attributes:
-        camera: a single camera.
         surface: (2,) [m].
         residuals: (m,) whitened; NaN for points that the camera does not see.
         rows: (m, f) their derivatives by free parameters.

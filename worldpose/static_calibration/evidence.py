@@ -70,10 +70,7 @@ class ClickEvidence:
         return 2 * int(points.sum()) + int(np.where(self.straight, 2, 4)[markings].sum())
 
     def on_surface(self, surface: Floats) -> ClickEvidence:
-        """Return the evidence at its places on another surface.
-
-        The surface is (2,) crown and end fall [m].
-        """
+        """Return the evidence at its places on another surface (2,), crown and end fall [m]."""
         change = surface - self.surface
         points, samples = self.points_world.copy(), self.samples_world.copy()
         points[:, 2] += self.points_by_surface @ change
@@ -90,9 +87,8 @@ def gather_evidence(
 ) -> ClickEvidence:
     """Return the evidence of one image, with samples along markings at a spacing [m].
 
-    Raises:
-        InputError: there are no clicks, a name is unknown or given twice, or a pixel lies outside
-            the image of a width and height [px].
+    InputError if there are no clicks, a name is unknown or given twice, or a pixel lies outside the
+    image of a width and height [px].
     """
     if not clicked.points and not clicked.drawn:
         raise InputError(

@@ -51,9 +51,7 @@ def fit_level_or_rolled(
 
     Before clicks count as outliers or as noisier than stated, and where the prior of the roll holds
     a camera, a fit with a free roll competes. `begin` returns the start (WIDTH,) of a problem.
-
-    Raises:
-        InputError: only an impossible camera explains the clicks.
+    InputError as of `fit_inliers`.
     """
     free_std, off_level = 1.0, 3.0  # of the sine of the roll; of its prior [standard deviations]
     enough, far_off = 12, 25.0  # constraints; mean loss beyond that of level cameras
@@ -142,10 +140,7 @@ def find_explanation(
 
 
 def _other_starts(problem: CameraProblem, settings: StaticCalibrationSettings) -> list[Floats]:
-    """Return starts (WIDTH,) that leave out one click each.
-
-    A single click under a wrong name may hold the robust fit in another minimum.
-    """
+    """Return starts (WIDTH,) without one click each: one wrong name may hold a fit in a minimum."""
     count = len(problem.evidence.points)
     if count > 16:
         return []
@@ -363,11 +358,7 @@ def _start_on_pitch(
     size: _PitchSize,
     settings: StaticCalibrationSettings,
 ) -> tuple[CameraProblem, Floats] | None:
-    """Return the clicked points on a pitch of another size, and a camera (WIDTH,) near the answer.
-
-    Returns:
-        None if a point is not in the Laws, or the points determine no camera.
-    """
+    """Return clicked points on a pitch of another size, and a camera (WIDTH,); None if unknown."""
     evidence, laws = problem.evidence, prescribed_points(pitch.spec, size[:2])
     if not set(evidence.points) <= laws.keys() or not has_enough_points(evidence):
         return None

@@ -34,7 +34,6 @@ class CameraProblem:
     """Observations, noise and prior of a camera fit, as the compiled kernels expect them.
 
     Attributes:
-        evidence: clicks and drawn markings.
         image_size: width, height [px].
         prior: (21,), see `prior_residuals`.
         free: (12,) parameters to solve for.

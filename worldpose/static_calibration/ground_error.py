@@ -19,11 +19,9 @@ class GroundErrorMap:
     """Expected ground error over the pitch: the coverage map of one camera.
 
     Attributes:
-        x: (columns,) [m], world.
-        y: (rows,) [m], world.
-        expected: (rows, columns) [m], root mean square distance on the surface between a place
-            and the back-projection of its true pixel by the estimated camera; NaN outside the
-            field of view.
+        x: (columns,) [m], world; y: (rows,) [m].
+        expected: (rows, columns) [m], root mean square distance on the surface between a place and
+            the back-projection of its true pixel; NaN outside the field of view.
     """
 
     x: Floats

@@ -39,8 +39,7 @@ CLEARANCE: Final = _GAP + _FLANK
 def brightness(picture: Image) -> Image:
     """Return the luma (height, width) of an image; chroma has half the resolution in video.
 
-    Raises:
-        InputError: the image is neither (height, width) nor (height, width, 3) of bytes.
+    InputError if the image is neither (height, width) nor (height, width, 3) of bytes.
     """
     if (
         picture.dtype != np.uint8
@@ -223,13 +222,11 @@ def _gather(
     across: Floats,
     values: Floats,
 ) -> int:
-    """Write the offsets across a line and the brightness of the pixels about a place on it.
+    """Write offsets across a line and the brightness of pixels about a place; return their count.
 
     No interpolation: between two pixels, the interpolated value of a line narrower than a pixel
-    depends on the position of the line in the pixel.
-
-    Returns:
-        Count; 0 if pixels lie outside the image, or there are too many.
+    depends on the position of the line in the pixel. The count is 0 if pixels lie outside the
+    image, or there are too many.
     """
     height, width = grey.shape
     wide = abs(normal[0]) * reach + abs(normal[1]) * ALONG
@@ -255,10 +252,7 @@ def _gather(
 
 @compile_kernel
 def _fit_bar(across: Floats, values: Floats, half: float) -> tuple[float, float, float, float]:
-    """Return a bar's offset [px], its contrast to either side, and the offset's variance [px^2].
-
-    The variance is infinite where the fit fails.
-    """
+    """Return a bar's offset [px], contrast to either side, variance [px^2], infinite if unfit."""
     count = len(across)
     shift = 0.0
     level = np.zeros(4)  # grass, paint, grass; the last entry is not used

@@ -50,14 +50,9 @@ from worldpose.static_calibration.venue import VenueEvidence, gather_venue_evide
 
 @dataclass(frozen=True)
 class MarkingFit:
-    """Detection result of one marking.
+    """Detection result of one marking: samples in the image, and inliers found among them.
 
-    Attributes:
-        name: name of the line or arc.
-        samples: count in the image.
-        found: count of inliers among them.
-        rms: root mean square residual of the inliers, measured minus projected across the line
-            [px]; NaN without inliers.
+    `rms` [px] is the root mean square residual of the inliers across the line; NaN without any.
     """
 
     name: str
@@ -72,16 +67,14 @@ class LineRefinement:
 
     Attributes:
         estimate: the refined camera; the start if refinement failed.
-        refined: whether refinement succeeded.
         reason: why it failed; empty on success.
         markings: markings in the image.
         rms: root mean square residual of all inliers, measured minus projected across the line
             [px]; NaN without inliers.
-        correlation: correlation of neighbouring residuals along a marking, mean over the samples
-            [1].
+        correlation: correlation of neighbouring residuals along a marking, mean over samples [1].
         effective_samples: equivalent number of independent inliers [1].
-        bars: bars of the fit; None if refinement failed.
-        noise: noise of paint and detection, learned from the residuals; None if refinement failed.
+        bars: bars of the fit; None if refinement failed, as `noise`.
+        noise: noise of paint and detection, learned from the residuals.
         venue: what the camera tells about the pitch; None before the final fit.
     """
 

@@ -28,10 +28,9 @@ class PaintNoise:
     """Standard deviations of the paint from the template, and of its detection.
 
     Paint deviates from the template by centimetres on real pitches: ground and paint are uneven
-    over a few metres. On a camera 8 m up and 50 m away, 2 cm of height are a pixel. A survey by
-    total station leaves millimetres. So the residuals of one image decide: the unevenness and the
-    error of a reading by empirical Bayes (MacKay 1992, "Bayesian interpolation"), with stated
-    minima.
+    over a few metres. On a camera 8 m up and 50 m away, 2 cm of height are a pixel. So the
+    residuals of one image decide: the unevenness and the error of a reading by empirical Bayes
+    (MacKay 1992, "Bayesian interpolation"), with stated minima.
 
     Attributes:
         points_m: standard deviation of the points that define markings, each axis [m].
@@ -88,7 +87,7 @@ class PaintUnknowns:
 
 
 def stated_noise(survey_error: float, shift: float) -> PaintNoise:
-    """Return the noise of a surveyed pitch without unevenness: the minimum.
+    """Return the minimum: the noise of a surveyed pitch without unevenness.
 
     Points that define markings have a survey error [m], each axis, and whole markings a shift [px].
     """
@@ -297,10 +296,7 @@ def _curvatures(camera: Camera, samples: LineSamples, normals: Floats) -> Floats
 
 
 def thin_samples(seen: ProjectedLines, samples: LineSamples, spacing: float, most: int) -> Integers:
-    """Return indices of visible samples at about even spacing [px] in the image.
-
-    The spacing grows where there would be more than about `most` samples.
-    """
+    """Return indices of about `most` visible samples at most, at about even spacing [px]."""
     index = np.flatnonzero(seen.visible)
     if not len(index):
         return index

@@ -16,10 +16,8 @@ def paint_share(picture: Image, camera: Camera, pitch: PitchTemplate) -> float |
     """Return the share of projected markings with a clearer ridge there than on either side [1].
 
     Ridges are brighter or darker than the ground, whichever are more: halls have dark lines. By
-    chance it is a third. A camera that is right has 0.6 and more: people hide the rest.
-
-    Returns:
-        None if the image would show too few markings to tell.
+    chance it is a third. A camera that is right has 0.6 and more: people hide the rest. None if the
+    image would show too few markings to tell.
     """
     samples = sample_markings(pitch, 0.5)
     seen = project_lines(camera, samples, 0.12, stated_noise(0.01, 1.0))

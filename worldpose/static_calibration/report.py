@@ -30,15 +30,13 @@ from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 @dataclass(frozen=True, eq=False)
 class PointResidual:
-    """Residual of a clicked point.
+    """Residual of a clicked point of the template.
 
     Attributes:
-        name: name of the template.
         pixel: (2,) [px], the click.
         residual: (2,) [px], projected minus clicked; NaN where the camera cannot image the point.
         mahalanobis: Mahalanobis distance from the prediction by the other evidence [1]; infinite
             where the camera cannot image the point.
-        inlier: whether the fit includes the click.
         problem: reason for exclusion; empty for inliers.
     """
 
@@ -52,14 +50,12 @@ class PointResidual:
 
 @dataclass(frozen=True)
 class MarkingResidual:
-    """Residual of a drawn marking.
+    """Residual of a drawn marking of the template: `inlier` is whether the fit includes it.
 
     Attributes:
-        name: name of the template.
         pixels: number of drawn pixels [1].
         rms: root mean square of their distances to the projected marking [px].
         worst: largest distance [px].
-        inlier: whether the fit includes the marking.
     """
 
     name: str
@@ -122,12 +118,7 @@ class CalibrationReport:
 
 @dataclass(frozen=True, eq=False)
 class StaticCalibration:
-    """Calibration result of one static camera.
-
-    Attributes:
-        estimate: camera and covariance.
-        report: residuals and warnings.
-    """
+    """Calibration result of one static camera: camera with covariance, and report."""
 
     estimate: CameraEstimate
     report: CalibrationReport
@@ -341,10 +332,7 @@ def _true_name(
 
 
 def calibration_arrays(calibration: StaticCalibration) -> dict[str, NDArray[Any]]:
-    """Return the stored arrays of a calibrated camera, by name.
-
-    A given camera has only those of `camera_arrays`.
-    """
+    """Return a camera's stored arrays by name; those of `camera_arrays` if it was given."""
     report = calibration.report
     mahalanobis = np.array([p.mahalanobis for p in report.points], dtype=np.float64)
     venue = None if report.lines is None else report.lines.venue

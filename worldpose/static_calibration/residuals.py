@@ -64,8 +64,8 @@ def linearize(
 ) -> float:
     """Return the objective at a camera (WIDTH,); write its Gauss-Newton matrix and gradient.
 
-    `c` is (WIDTH,), `information` (12, 12), zero for fixed parameters, `observed` (12, 12) the part
-    of clicks and drawn markings, `gradient` (12,); the last three are written.
+    Written are `information` (12, 12), zero for fixed parameters, `observed` (12, 12), the part of
+    clicks and drawn markings, and `gradient` (12,).
     """
     n, d = len(given.points_world), len(given.drawn_image)
     click, by_click = np.empty((n, 2)), np.empty((n, 2, STEP))
@@ -178,15 +178,10 @@ def nearest_on_markings(
 ) -> None:
     """Write the nearest place on its marking of each drawn pixel, and the unit normal there.
 
-    Args:
-        c: (WIDTH,) camera.
-        reach: half the image diagonal [px].
-        samples: (s, 3) [m], world.
-        bounds: (m + 1,); samples `bounds[k]` to `bounds[k + 1]` belong to marking k.
-        pixels: (d, 2) [px].
-        marking: (d,).
-        place: (d, 3) [m], world, written; NaN where the marking is not in front of the camera.
-        normal: (d, 2), written: from the marking to the pixel, either sign.
+    Samples (s, 3) [m], world, from `bounds[k]` to `bounds[k + 1]` (m + 1,) belong to marking k;
+    `pixels` (d, 2) [px] have `marking` (d,). `reach` is half the image diagonal [px]. Written are
+    `place` (d, 3) [m], world, NaN where the marking is not in front of the camera `c` (WIDTH,), and
+    `normal` (d, 2) from the marking to the pixel, either sign.
     """
     max_radius = 1.5  # beyond, Brown's polynomials may fold a marking back into the image
     camera = load_camera(c.reshape(1, WIDTH), 0)

@@ -51,8 +51,8 @@ class SideDecision:
         turned: whether it has to be turned; None = the people do not tell.
         evidence: log probability ratio of the least sure step of the decision [1].
         contradicted: whether people contradict the stated side.
-        partners: cameras that see the same people, the surest first; those against a contradicted
-            side.
+        partners: cameras that see the same people, the surest first; those against it if
+            contradicted.
     """
 
     turned: bool | None
@@ -63,8 +63,7 @@ class SideDecision:
     def require_side(self, where: str) -> bool:
         """Return whether the camera has to be turned.
 
-        Raises:
-            InputError: the people do not tell the side, or they contradict the stated one.
+        InputError if people do not tell the side, or contradict the stated one.
         """
         if self.contradicted:
             raise InputError(
@@ -162,9 +161,8 @@ def _find_contradicted(evidence: Floats, anchored: list[int]) -> set[int]:
 def _join(evidence: Floats, groups: list[list[int]]) -> tuple[list[list[int]], Floats, Floats]:
     """Join groups of cameras whose relative side the evidence decides, the surest two first.
 
-    Returns:
-        The groups; the sign (n,) of every camera, -1 if it is turned against the first camera of
-        its group; the evidence (n,) of the least sure join that decides the camera.
+    Return groups; signs (n,), -1 of a camera that is turned against the first of its group; and the
+    evidence (n,) of the least sure join that decides the camera.
     """
     groups, count = [list(each) for each in groups], len(evidence)
     sign, surety = np.ones(count), np.full(count, np.inf)

@@ -25,12 +25,7 @@ _CONTAINERS: Final = (dict, list, tuple)
 
 
 def canonical_json(value: object) -> bytes:
-    """Return the JSON of `value`: sorted keys, no spaces, UTF-8, finite numbers only.
-
-    Raises:
-        InputError: the value contains something without an exact JSON form: NaN, infinity, a key
-            that is not text, a lone surrogate, an array.
-    """
+    """Return the JSON of `value`, sorted and in UTF-8; InputError if it has no exact JSON form."""
     try:
         text = json.dumps(
             value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
@@ -86,18 +81,7 @@ def seal(record: Record) -> bytes:
 
 
 def unseal(kind: type[R], data: bytes, where: str) -> R:
-    """Return the record in the document `data`.
-
-    Args:
-        kind: the record's class.
-        data: the document.
-        where: the document's path, for messages.
-
-    Raises:
-        CorruptionError: the bytes differ from the sealed ones.
-        InputError: an intact document, but of an unsupported contract version, or with the fields
-            of another version.
-    """
+    """Return the record in `data`; CorruptionError if damaged, InputError of another version."""
     content = _content_after_seal(data)
     if content is not None:
         try:
@@ -152,13 +136,10 @@ def read_checksum(data: bytes) -> str:
 
 
 def _content_after_seal(data: bytes) -> bytes | None:
-    """Return the content of a document that begins with its checksum.
+    """Return the content of a document that begins with its checksum; None for any other.
 
     The function cuts the checksum out of the text; the remaining bytes must be those from which
     `seal` computed it. Parsing the JSON and writing it again would take ten times as long.
-
-    Returns:
-        None if another key comes before the checksum, or the rest does not match the checksum.
     """
     found = _SEAL.match(data)
     if found is None or not data.endswith(b"}\n"):
@@ -172,11 +153,7 @@ def _dump_fields(record: Record) -> dict[str, Any]:
 
 
 def read_published(blobs: Blobs, result: ResultId, file: StoredFile) -> bytes:
-    """Return the bytes of one file after verifying that they are the published ones.
-
-    Raises:
-        CorruptionError: the file is missing or its bytes have changed.
-    """
+    """Return the bytes of one file; CorruptionError unless they are the published ones."""
     path = f"{result.path}/{file.path}"
     data = blobs.read(path)
     there = None if data is None else (len(data), digest(data))
@@ -199,11 +176,7 @@ def _require_published(
 
 
 def verify_published(blobs: Blobs, result: ResultId, file: StoredFile) -> None:
-    """Verify that the bytes of one file are the published ones, without holding them in memory.
-
-    Raises:
-        CorruptionError: as `read_published`.
-    """
+    """Verify as `read_published` the bytes of one file, without holding them in memory."""
     path = f"{result.path}/{file.path}"
     _require_published(blobs, path, file, blobs.digest(path))
 

@@ -59,16 +59,10 @@ def plan_gc(
     manifest is damaged or of another version: the results that its runs reach are unknown. A record
     that `keep_last` drops need not be readable. Planning removes nothing.
 
-    Args:
-        store: the project.
-        keep_last: keep only this many of each match's newest run records, the newest complete one
-            with results of each stage, and all iterations of the last call; None keeps all.
-        forget: runs to drop, as `match/0003`; an unfinished one counts as dead, and a pinned one
-            must be unpinned first.
-        older_than: the age below which results and leftovers are kept.
-
-    Raises:
-        InputError: `forget` names a missing or pinned run, or `keep_last` is below 1.
+    `keep_last` keeps only this many of each match's newest run records, the newest complete one
+    with results of each stage, and all iterations of the last call; None keeps all. `forget` names
+    runs to drop, as `match/0003`; an unfinished one counts as dead. Results and leftovers below the
+    age `older_than` are kept. InputError if `forget` names a missing or pinned run.
     """
     known = _run_files(store)
     _check_arguments(store, keep_last, forget)
@@ -118,10 +112,8 @@ def collect(store: Store, plan: GcPlan) -> int:
     """Remove the items of `plan` and return the freed size [byte].
 
     Records are removed before the results that they name, manifests before their files: after any
-    interruption, every readable result is whole, and the next plan finds the rest.
-
-    Raises:
-        StoreError: a run was started, ended or pinned since the plan was made; nothing is removed.
+    interruption, every readable result is whole, and the next plan finds the rest. StoreError if a
+    run was started, ended or pinned since the plan was made; nothing is removed then.
     """
     if plan.runs != _run_files(store):
         raise StoreError(

@@ -54,9 +54,8 @@ def checked_arrays(
 ) -> dict[str, NDArray[Any]]:
     """Return all arrays by name in the layout's order, unchanged.
 
-    Raises:
-        InternalError: an array is unknown, absent, of another dtype or dimension, disagrees with
-            another in a dimension's size, or holds NaN or infinity against its layout.
+    InternalError if an array is unknown, absent, of another dtype or dimension, disagrees with
+    another in a dimension's size, or holds NaN or infinity against its layout.
     """
     _check_names(layout, "array", arrays, [array.name for array in layout.arrays])
     _check_names(layout, "coordinate", coordinates, [array.name for array in layout.coordinates])
@@ -83,10 +82,7 @@ def checked_arrays(
 
 
 def array_parts(array: ArrayLayout, shape: tuple[int, ...]) -> list[tuple[slice, ...]]:
-    """Return the slices of consecutive parts of an array of `shape`: one file each.
-
-    An array can be longer than memory, so it is processed one part at a time.
-    """
+    """Return the slices of an array's consecutive parts, one file each: it may exceed memory."""
     if 0 in shape:
         return []
     whole = tuple(slice(0, size) for size in shape)
@@ -110,10 +106,7 @@ def release_memory(values: NDArray[Any]) -> None:
 
 
 def normalize_nans(values: NDArray[Any]) -> NDArray[Any]:
-    """Return the values with one bit pattern for every NaN.
-
-    The sign and payload of NaNs depend on the processor's code path.
-    """
+    """Return the values with one bit pattern for every NaN, which processors write with several."""
     if values.dtype.kind != "f":
         return values
     return np.where(np.isnan(values), values.dtype.type(np.nan), values)
@@ -124,12 +117,8 @@ def checked_attributes(
 ) -> dict[str, Any]:
     """Return the group's attributes as plain JSON, in the layout's order.
 
-    An attribute with the name of a dimension labels it, so it must be a list of the dimension's
-    size.
-
-    Raises:
-        InternalError: an attribute is unknown, absent, not plain JSON, or a wrong label of a
-            dimension.
+    An attribute with the name of a dimension is a list that labels it, of the dimension's size.
+    InternalError for another list, and if one is unknown, absent or not plain JSON.
     """
     _check_names(layout, "attribute", attributes, list(layout.attributes))
     try:
@@ -327,24 +316,13 @@ def write_group(
     coordinates: Arrays,
     attributes: Mapping[str, Any],
 ) -> int:
-    """Write the group to `folder`; equal arrays and attributes give equal files.
+    """Write the group to an empty folder; return the number of files.
 
-    Chunks are lz4 with a CRC-32C of the compressed bytes, so that any Zarr reader refuses a changed
-    chunk. Empty chunks are written, too: a lost chunk never becomes a fill value. A file holds up
-    to `SHARD_CHUNKS` chunks of an array (Zarr's sharding), and is written whole.
-
-    Args:
-        folder: an empty folder.
-        layout: required form of the arrays.
-        arrays: arrays by name; those in `layout.optional` can be absent.
-        coordinates: one-dimensional arrays by name.
-        attributes: the attributes that `layout.attributes` requires.
-
-    Returns:
-        The number of files.
-
-    Raises:
-        InternalError: the arrays or attributes do not match the layout.
+    Equal arrays and attributes give equal files. Chunks are lz4 with a CRC-32C of the compressed
+    bytes, so that any Zarr reader refuses a changed chunk. Empty chunks are written, too: a lost
+    chunk never becomes a fill value. A file holds up to `SHARD_CHUNKS` chunks of an array (Zarr's
+    sharding), and is written whole. Coordinates are one-dimensional. InternalError if arrays, of
+    which those in `layout.optional` can be absent, or attributes do not match the layout.
     """
     checked = checked_arrays(layout, arrays, coordinates)
     given = checked_attributes(layout, checked, attributes)
@@ -401,16 +379,10 @@ def write_group(
 def _write_shard(
     file: Path, array: ArrayLayout, values: NDArray[Any], shape: tuple[int, ...]
 ) -> None:
-    """Write one file of an array in the format of Zarr's sharding.
+    """Write one new file of an array of `shape`, with its part `values`, as Zarr's sharding does.
 
     Zarr itself would hold a file's chunks three times in memory, at twice the time. The file has
     the chunks in order, each with its CRC-32C, then the index of their places with its CRC-32C.
-
-    Args:
-        file: the file; neither it nor its folder exists.
-        array: layout of the array.
-        values: this file's part of the array.
-        shape: shape of the array.
     """
     # Place and size of a chunk beyond the end of an array in the index of a file.
     no_chunk = (1 << 64) - 1

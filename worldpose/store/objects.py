@@ -34,21 +34,14 @@ LISTINGS = 100
 
 @dataclass(frozen=True)
 class ObjectBlobs:
-    """Objects below `prefix` of `bucket`.
-
-    obstore reads endpoint, region and credentials from AWS_* variables.
-    """
+    """Objects below `prefix` of `bucket`; AWS_* variables have endpoint, region, credentials."""
 
     bucket: str
     prefix: str
 
     @classmethod
     def at(cls, url: str) -> ObjectBlobs:
-        """Open the root `s3://bucket/prefix`.
-
-        Raises:
-            InputError: there is no bucket in the URL.
-        """
+        """Open the root `s3://bucket/prefix`; InputError without a bucket."""
         bucket, _, prefix = url.removeprefix("s3://").strip("/").partition("/")
         if not bucket:
             raise InputError(
@@ -191,8 +184,7 @@ class ObjectBlobs:
     def publish_tree(self, folder: Path, prefix: str, manifest_name: str, manifest: bytes) -> bool:
         """See `Blobs`. Objects first, each created once; the manifest's creation publishes.
 
-        Raises:
-            NondeterminismError: an interrupted writer left other bytes for the same result.
+        NondeterminismError if an interrupted writer left other bytes for the same result.
         """
         if self.exists(f"{prefix}/{manifest_name}"):
             return False

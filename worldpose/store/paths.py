@@ -137,11 +137,7 @@ def queue_path(run: QueuedRun) -> str:
 
 
 def checked_name(name: str) -> str:
-    """Return `name` after checking that it is safe as a file name.
-
-    Raises:
-        InputError: the name is not safe.
-    """
+    """Return `name`; InputError if it is not safe as a file name."""
     try:
         return _NAME.validate_python(name)
     except ValidationError as error:
@@ -160,9 +156,8 @@ def _bad_name(where: str, length: str, name: str) -> InputError:
 def checked_path(path: str) -> str:
     """Return `path` if it stays inside the project on every file system and object store.
 
-    Raises:
-        InputError: the path is absolute or empty, or has `..`, `.`, an empty part, a NUL, a line
-            break or a backslash.
+    InputError if it is absolute or empty, or has `..`, `.`, an empty part, a NUL, a line break or a
+    backslash.
     """
     parts = path.split("/")
     if any(part in ("", ".", "..") for part in parts) or set(path) & set("\0\n\r\\"):

@@ -52,8 +52,7 @@ class RecipeDifference:
     Attributes:
         kind: part of the recipe.
         name: name within that part; empty if the part is a single value.
-        before: value in the old recipe as short text, or `absent`.
-        after: value in the new one.
+        before: value in the old recipe as short text, or `absent`; `after` is that in the new one.
     """
 
     kind: DifferenceKind

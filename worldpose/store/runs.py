@@ -29,10 +29,8 @@ from worldpose.store.paths import checked_name, is_name, pin_path
 def pin_run(blobs: Blobs, pin: Pin) -> Pin:
     """Pin a run under a name; return the pin in force.
 
-    Pinning the same run under the same name again changes nothing.
-
-    Raises:
-        InputError: the name is a number or `latest`, or is another run's.
+    Pinning the same run under the same name again changes nothing. InputError if the name is a
+    number or `latest`, or is another run's.
     """
     if pin.name == "latest" or pin.name.isdigit():
         raise InputError(
@@ -59,11 +57,7 @@ def pin_run(blobs: Blobs, pin: Pin) -> Pin:
 
 
 def unpin_run(blobs: Blobs, match_id: str, name: str) -> Pin:
-    """Remove a pin, so that its run can be forgotten; return it.
-
-    Raises:
-        InputError: there is no such name.
-    """
+    """Remove a pin, so that its run can be forgotten; return it. InputError if there is none."""
     pin = read_pin(blobs, match_id, name)
     if pin is None:
         names = ", ".join(known.name for known in list_pins(blobs, match_id))
@@ -85,9 +79,7 @@ def read_pin(blobs: Blobs, match_id: str, name: str) -> Pin | None:
 def read_document(blobs: Blobs, path: str, kind: type[R]) -> R | None:
     """Return the record at a path; None if there is none.
 
-    Raises:
-        CorruptionError: it is damaged; the error says how to repair it.
-        InputError: it is of another version.
+    CorruptionError, with how to repair it, if it is damaged, InputError if of another version.
     """
     data = blobs.read(path)
     try:
@@ -138,9 +130,7 @@ def hold_lock(file: Path, *, wait: bool, most_seconds: float = 600.0) -> Iterato
 
     The operating system releases the lock when the process ends, however it ends. The parent of the
     lock's folder must exist, and not be empty: there a project's disk may not be mounted.
-
-    Raises:
-        InputError: another process has held it for `most_seconds` of waiting.
+    InputError if another process has held it for `most_seconds` [s] of waiting.
     """
     end = time.monotonic() + most_seconds
     if not file.parent.exists() and any(file.parent.parent.iterdir()):

@@ -63,9 +63,7 @@ class Store:
     def create(cls, url: str | os.PathLike[str]) -> Store:
         """Open the project at `url`, or create it if it does not exist.
 
-        Raises:
-            InputError: `url` has a project of another contract version.
-            StoreError: `url` is not writable.
+        InputError if that has another contract version, StoreError if it is not writable.
         """
         blobs = open_blobs(os.fspath(url))
         blobs.put_new(PROJECT, seal(Project(store_format=STORE_FORMAT)))
@@ -73,11 +71,7 @@ class Store:
 
     @classmethod
     def open(cls, url: str | os.PathLike[str]) -> Store:
-        """Open the project at `url`.
-
-        Raises:
-            InputError: there is no project, or one of another contract version or store format.
-        """
+        """Open the project at `url`; InputError if it is none, or of another contract or format."""
         blobs = open_blobs(os.fspath(url))
         data = blobs.read(PROJECT)
         if data is None:
@@ -104,12 +98,9 @@ class Store:
 
     @classmethod
     def open_or_new(cls, url: str | os.PathLike[str]) -> Store:
-        """Open the project at `url`; if there is none, the first `register` creates it.
+        """Open the project at `url` as `open`; if there is none, the first `register` creates it.
 
         Input can thus be validated first, and refused input leaves nothing behind.
-
-        Raises:
-            InputError: `url` has a project of another contract version or store format.
         """
         blobs = open_blobs(os.fspath(url))
         return cls.open(url) if blobs.exists(PROJECT) else cls(blobs)
@@ -145,11 +136,9 @@ class Store:
         )
 
     def manifest(self, match_id: str, stage: str, unit: str, key: str) -> ResultManifest:
-        """Return the manifest of a published result.
+        """Return the manifest of a published result, StoreError if it is not published.
 
-        Raises:
-            StoreError: the result is not published.
-            CorruptionError: its manifest is damaged, or belongs to another result.
+        CorruptionError if the manifest is damaged, or belongs to another result.
         """
         result = ResultId(match_id, stage, unit, key)
         where = f"{self.url}/{result.manifest_path}"
@@ -174,12 +163,9 @@ class Store:
         """Yield a writer whose result is published only when the block ends without an error.
 
         An error in the block leaves nothing behind; a killed process leaves only private staging.
-        If the key is already published, equal content changes nothing.
-
-        Raises:
-            InputError: the work's key does not match its recipe.
-            NondeterminismError: the key is published with other content.
-            StoreError: the disk is full or not writable; nothing is published.
+        If the key is already published, equal content changes nothing, and other content raises
+        NondeterminismError. InputError if the work's key does not match its recipe, StoreError if
+        the disk is full or not writable.
         """
         if work.key != recipe_key(work.recipe):
             raise InputError(
@@ -209,11 +195,8 @@ class Store:
         """Open a published result as labelled arrays, with units and conventions in the attributes.
 
         Values are read on access, and every byte is then verified against the manifest; with
-        `verify`, every file is verified now.
-
-        Raises:
-            StoreError: the result is not published.
-            CorruptionError: a file is missing or changed (on access, unless `verify`).
+        `verify`, every file is verified now. StoreError if the result is not published,
+        CorruptionError if a file is missing or changed.
         """
         # Imported here: status and resumed runs need only manifests, and Zarr takes most of a
         # second.
@@ -250,11 +233,7 @@ class Store:
             self.blobs.delete(path)
 
     def finish_run(self, record: RunRecord) -> None:
-        """Write the record of a run, only once.
-
-        Raises:
-            StoreError: a named result is not published, or the run has another record.
-        """
+        """Write the record of a run, once; StoreError if a result it names is not published."""
         results = [
             ResultId.from_name(record.match_id, name, key) for name, key in record.results.items()
         ]
@@ -295,9 +274,7 @@ class Store:
     def run(self, match_id: str, run_id: str = LATEST) -> RunRecord:
         """Return the record of a finished run by number or name; `latest` has the highest number.
 
-        Raises:
-            InputError: there is no such run.
-            CorruptionError: the record is damaged.
+        InputError if there is none, CorruptionError if it is damaged.
         """
         finished, reserved, _ = run_files(self.blobs, match_id)
         names = sorted(finished, key=run_order)
@@ -343,11 +320,7 @@ class LateStore(Store):
 
 
 def open_blobs(url: str) -> Blobs:
-    """Return the files at `url`: a folder, or `s3://bucket/prefix`.
-
-    Raises:
-        InputError: another scheme, or no bucket.
-    """
+    """Return the files at `url`: a folder, or `s3://bucket/prefix`; InputError for any other."""
     if url.startswith("s3://"):
         # Late: object storage is an extra, and needs obstore.
         from worldpose.store.objects import ObjectBlobs
@@ -401,21 +374,14 @@ class Run(Mapping[str, "xr.Dataset"]):
         return self.store.manifest(self.record.match_id, stage, unit, self.record.results[name])
 
     def bodies(self, clip: str) -> xr.Dataset:
-        """Return the best bodies of a clip: refitted ones where the run has them.
+        """Return the best bodies of a clip, refitted ones if the run has them; InputError if none.
 
         `run.bodies(clip).joints` are their keypoints; `.to_dataframe()` of any array gives pandas.
-
-        Raises:
-            InputError: the run has no bodies of the clip.
         """
         return self._best(clip, BODY_STAGES)
 
     def joints(self, clip: str) -> xr.Dataset:
-        """Return the best result with `joints` and `covariance` of a clip: bodies, if it has any.
-
-        Raises:
-            InputError: the run has no joints of the clip.
-        """
+        """Return the best result with `joints` and `covariance` of a clip, or InputError."""
         return self._best(clip, JOINT_STAGES)
 
     def _best(self, clip: str, stages: Sequence[str]) -> xr.Dataset:

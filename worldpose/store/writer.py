@@ -52,9 +52,7 @@ class ResultWriter:
     ) -> None:
         """Write the result's arrays, once; see `worldpose.store.groups.write_group`.
 
-        Raises:
-            InternalError: the arrays do not match the layout.
-            StoreError: the disk is full or not writable, or the result was written already.
+        StoreError if the disk is full or not writable, or the result was written already.
         """
         # Imported here: status and resumed runs need only manifests, and Zarr takes most of a
         # second.
@@ -80,11 +78,9 @@ class ResultWriter:
         pass_commit_point("after_write")
 
     def sealed_manifest(self) -> ResultManifest:
-        """Return the manifest of the written files.
+        """Return the manifest of the written files; InternalError if a metric is not finite.
 
-        Raises:
-            InternalError: a metric is not finite.
-            StoreError: nothing was written, or files are missing.
+        StoreError if nothing was written, or files are missing.
         """
         name = self._work.recipe.name
         if not self._files:

@@ -17,13 +17,9 @@ def measure_absences(
     `absent_share` is the larger one of the frames without a person over all frames, and of the
     frames of people who are missing between frames that show them, over all of their frames in
     between [1]. The longest absence lasts from `absent_from_frame` to `absent_to_frame`, and is
-    that of `absent_person`, or without this one of all people.
-
-    Args:
-        present: (frames, persons) whether a camera sees the tracked person.
-        frame: (frames,) frame numbers, rising.
-        people: (persons,) their numbers.
-        fps: frames per second.
+    that of `absent_person`, or without this one of all people. `present` (frames, persons) is
+    whether a camera sees the tracked person at rising frame numbers (frames,); people have numbers
+    (persons,).
     """
     if not present.size:
         return {"absent_share": float(len(frame) > 0)}

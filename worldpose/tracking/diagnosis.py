@@ -49,12 +49,7 @@ MATCH: Final = np.dtype(
 
 @dataclass(frozen=True)
 class NoPeople:
-    """Cause of an empty tracking result.
-
-    Attributes:
-        cause: one word.
-        message: the reason with its numbers, and what to do, in full sentences.
-    """
+    """Cause of an empty result in one word; and in sentences the reason and what to do."""
 
     cause: str
     message: str
@@ -62,13 +57,7 @@ class NoPeople:
 
 @dataclass(frozen=True)
 class PairMatches:
-    """Matches of the detections of two cameras.
-
-    Attributes:
-        cameras: indices of the two.
-        possible: largest possible number of matches.
-        matches: (matches,) of `MATCH`.
-    """
+    """Matches (matches,) of `MATCH` of two cameras' detections, of which so many are possible."""
 
     cameras: tuple[int, int]
     possible: int
@@ -100,12 +89,8 @@ def match_pair(
 ) -> PairMatches:
     """Return the matches of two cameras' detections, the second's `shift` frames later.
 
-    Args:
-        cameras: batch (cameras,).
-        rays: (frames, cameras, detections, 17, 3) unit rays [world]; NaN where not seen.
-        pair: indices of the two cameras.
-        shift: frames by which the second camera's detections are later.
-        least: least number of joints in both detections.
+    Rays (frames, cameras, detections, 17, 3) are unit vectors [world], NaN where not seen; both
+    detections have `least` joints or more.
     """
     a, b = pair
     seen = np.asarray(np.isfinite(rays[..., 0]).any(axis=(-1, -2)))
@@ -200,16 +185,10 @@ def diagnose_no_people(
 ) -> NoPeople:
     """Return the reason why tracking found no person in the clip.
 
-    Args:
-        cameras: batch (cameras,).
-        camera_ids: ids of these.
-        detections: (frames, cameras, detections); a confidence of 0, less or NaN where not found.
-        fps: frames per second [1/s].
-        settings: settings of the tracking run.
-        pitch_size: length and width of the pitch around the origin [m], on which people stand at
-            z = 0; None = they may be anywhere.
-        births: tracks that began and were dropped again.
-        rates: (cameras,) frames of a camera's video per match frame.
+    Detections are (frames, cameras, detections), with a confidence of 0, less or NaN where not
+    found. `pitch_size` is the length and width of the pitch around the origin [m], on which people
+    stand at z = 0; None = they may be anywhere. `births` counts tracks that began and were dropped
+    again; `rates` (cameras,) are frames of a camera's video per match frame.
     """
     ground = pitch_size is not None
     joints = _count_joints(detections)

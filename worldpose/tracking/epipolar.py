@@ -62,13 +62,10 @@ def limb_lengths(joints: Floats, fps: float) -> tuple[Floats, Floats]:
 def footprints(centers: Floats, directions: Floats, ground: tuple[float, float]) -> Floats:
     """Return the ground position of each detection's person (n, 3): x, y and uncertainty [m].
 
-    The mean ray is cut at the height of a body's centre; the uncertainty is the length of its
-    ground track within the possible heights of the centre.
-
-    Args:
-        centers: (n, 3) [m], world, of each detection's camera.
-        directions: (n, joints, 3) unit rays, world; NaN where not seen.
-        ground: middle and half extent of those heights [m]; an infinite extent = no ground.
+    The mean of unit rays (n, joints, 3), NaN where not seen, from camera centers (n, 3) [m], world,
+    is cut at the height of a body's centre; the uncertainty is the length of its ground track
+    within the possible heights. `ground` is their middle and half extent [m]; an infinite extent =
+    no ground.
     """
     n, joint_count, _ = directions.shape
     places = np.zeros((n, 3))
@@ -98,21 +95,13 @@ def pair_distances(
     min_sine: float,
     gate: float,
 ) -> Floats:
-    """Return the mean distance between the rays of every two detections of different cameras.
+    """Return mean distances (n, n) [m] between the rays of two detections, in the upper triangle.
 
-    Args:
-        centers: (n, 3) [m], world, of each detection's camera.
-        directions: (n, joints, 3) unit rays, world; NaN where not seen.
-        camera: (n,) index of each detection's camera.
-        places: (n, 3) [m], footprints; two farther apart than their uncertainties are two people.
-        min_joints: least number of joints seen by both.
-        min_sine: least mean sine of the angle between the rays.
-        gate: distance beyond which a pair is rejected [m].
-
-    Returns:
-        (n, n) [m], upper triangle; infinite where two detections cannot start a group: same camera,
-        other positions on the ground, too few joints in common, beyond the gate, or nearly parallel
-        rays.
+    Detections have camera centers (n, 3) [m], world, unit rays (n, joints, 3), NaN where not seen,
+    camera indices (n,), and `places` (n, 3) [m], footprints. A distance is infinite where two
+    cannot start a group: of the same camera, farther apart on the ground than their uncertainties,
+    with less than `min_joints` in common, beyond the gate [m], or at a mean sine of angles below
+    `min_sine`.
     """
     n, joint_count, _ = directions.shape
     distances = np.full((n, n), np.inf)
@@ -141,20 +130,14 @@ def associate(
 ) -> list[Sighting]:
     """Return the people in agreeing detections of at least `birth_views` cameras.
 
-    The two nearest detections start a group; every other camera adds the detection nearest to
-    their intersection. A group of too few views, or of impossible size, is no person.
+    The two nearest detections start a group; every other camera adds the detection nearest to their
+    intersection. A group of too few views, or of impossible size, is no person; each detection
+    joins one group at most.
 
-    Args:
-        centers: (cameras, 3) [m], world.
-        directions: (cameras, detections, 17, 3) unit rays, world; NaN where not seen or matched.
-        weights: (cameras, detections, 17), of the squared angle; 0 where not seen or matched.
-        ground: whether people stand on z = 0.
-        settings: gates and least views.
-        gate: largest mean distance between the rays of two detections of one person [m]; None =
-            `epipolar_gate_m`.
-
-    Note:
-        Each detection joins one group at most.
+    Centers (cameras, 3) [m] and unit rays (cameras, detections, 17, 3) are in the world; rays are
+    NaN, and weights (cameras, detections, 17) of the squared angle are 0, where not seen or
+    matched. `ground` is whether people stand on z = 0. The largest mean distance between the rays
+    of two detections of one person is `gate` [m]; None = `epipolar_gate_m`.
     """
     cameras = len(centers)
     needed = settings.birth_views

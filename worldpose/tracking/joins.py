@@ -44,10 +44,8 @@ class Candidate:
     """A possible join of two tracks, the later one as continuation of the earlier.
 
     Attributes:
-        before: number of the track that ends.
-        after: number of the track that begins.
-        last_frame: last frame of the earlier track.
-        first_frame: first frame of the later track.
+        before: number of the track that ends, in `last_frame`.
+        after: number of the track that begins, in `first_frame`.
         cost: minus the logarithm of the odds that they are one person rather than two strangers.
         margin: additional cost of the best alternative without this join [nat].
         decided: whether they were joined.
@@ -71,17 +69,11 @@ def fit_track_ends(
     settings: TrackingSettings,
     cameras: int,
 ) -> tuple[End, End]:
-    """Return the start and the end of a track.
+    """Return the start and the end of a track of a rig's `cameras`.
 
-    Args:
-        number: number of the track.
-        frames: (n,) frames whose rays determined the position.
-        joints: (n, 17, 3) [m], world; NaN where not determined.
-        views: (n,) cameras that see the person; of more than two cameras, the limbs of two are not
-            used, as one of them may show somebody else.
-        fps: frames per second [1/s].
-        settings: times.
-        cameras: number of the rig's cameras.
+    Frames (n,) are those whose rays determined the position, joints (n, 17, 3) [m], world, NaN
+    where not determined. Of more than two cameras, the limbs of two views (n,) are not used, as one
+    of them may show somebody else.
     """
     torso, whole = _mean_known(joints[:, COCO17_TORSO]), _mean_known(joints)
     places = np.where(np.isfinite(torso), torso, whole)
@@ -109,21 +101,12 @@ def _mean_known(points: Floats) -> Floats:
 def join_costs(
     before: list[End], after: list[End], fps: float, area: float, settings: TrackingSettings
 ) -> Floats:
-    """Return the cost of joining every track that ends to every track that begins.
+    """Return the cost (n, m) [nat] of joining tracks that end to tracks that begin.
 
-    Between two sightings a person's velocity is a random walk: the expected start of the second
-    track follows from the mean of both velocities, or from the first's if the second's is unknown,
-    and its uncertainty grows with the gap.
-
-    Args:
-        before: n tracks that end.
-        after: m tracks that begin.
-        fps: frames per second [1/s].
-        area: ground on which people move [m^2].
-        settings: statistics of people's motion and size.
-
-    Returns:
-        (n, m) [nat], minus the log odds of one person; infinite where impossible.
+    It is minus the log odds of one person; infinite where impossible. Between two sightings a
+    person's velocity is a random walk: the expected start of the second track follows from the mean
+    of both velocities, or from the first's if the second's is unknown, and its uncertainty grows
+    with the gap. `area` is the ground on which people move [m^2].
     """
     costs = np.full((len(before), len(after)), np.inf)
     for i, old in enumerate(before):
@@ -317,13 +300,9 @@ def find_takeovers(
 ) -> list[Takeover]:
     """Return people who, after a gap, took a detection that another person lost in this frame.
 
-    Whether the other person is located again is not known yet.
-
-    Args:
-        people: n followed people, before this frame's update.
-        frame: number of the frame.
-        index: (cameras, n) matched detections; -1 = none.
-        affinity: (cameras, n, detections); minus infinity beyond the gates.
+    Whether the other person is located again is not known yet. The n people are followed, before
+    this frame's update. The matched detections `index` are (cameras, n), -1 = none, the affinity
+    (cameras, n, detections), minus infinity beyond the gates.
     """
     views = np.count_nonzero(index >= 0, axis=0)
     placed = np.array([person.last_fixed == frame - 1 for person in people], dtype=np.bool_)
@@ -358,13 +337,9 @@ def lasting_takeovers(
 def describe_doubts(
     frames: Integers, people: int, takeovers: Sequence[Takeover], joins: Sequence[Join]
 ) -> str | None:
-    """Return a warning about ambiguous identities; None if there are few.
+    """Return a warning about ambiguous identities of a clip, of frames (frames,); None if few.
 
-    Args:
-        frames: (frames,) numbers of the clip's frames.
-        people: number of people.
-        takeovers: takeovers, by indices of frames in the clip.
-        joins: joins of the clip, decided or not.
+    Takeovers are by indices of frames in the clip, joins decided or not.
     """
     parts = []
     max_named = 3  # Most doubts that the warning names one by one.

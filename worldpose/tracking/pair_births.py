@@ -63,13 +63,10 @@ class CameraVisibility:
         return np.asarray((inside >= 0.8 * known) & (known > 0) & near)
 
     def learn(self, joints: Floats, directions: Floats, weights: Floats, seen: Flags) -> None:
-        """Update with the known people of one frame.
+        """Update with known people of a frame, whom cameras have `seen` (cameras, n) or not.
 
-        Args:
-            joints: (n, 17, 3) [m], world; NaN where unknown, not all of one person.
-            directions: (cameras, detections, 17, 3) unit rays, world; NaN where not seen.
-            weights: (cameras, detections, 17); 0 where not seen.
-            seen: (cameras, n) whether the camera shows the person.
+        Joints (n, 17, 3) [m], world, are NaN where unknown; unit rays (cameras, detections, 17, 3)
+        are NaN, and weights (cameras, detections, 17) are 0, where not seen.
         """
         away = np.linalg.norm(np.nanmean(joints, axis=1) - self.centers[:, None], axis=-1)
         self.reach = np.maximum(self.reach, np.where(seen, away, 0.0).max(axis=1, initial=0.0))
@@ -86,13 +83,8 @@ class CameraVisibility:
         """Return the log probability (n,) that cameras miss bodies which they should see.
 
         A camera that cannot see the position adds nothing, and neither does one with a detection
-        there, which may occlude the body.
-
-        Args:
-            joints: (n, 17, 3) [m], world.
-            directions: (cameras, detections, 17, 3) unit rays, world; NaN where not seen.
-            weights: (cameras, detections, 17); 0 where not seen.
-            own: (cameras, n) cameras whose detections the body is from.
+        there, which may occlude the body. `own` (cameras, n) are the cameras whose detections the
+        body is from; other arguments are as of `learn`.
         """
         if not len(joints):
             return np.zeros(0)
@@ -109,12 +101,9 @@ def find_uncovered_bodies(
 ) -> Flags:
     """Return in which of the asked cameras no detection lies on the image of bodies (cameras, n).
 
-    Args:
-        asked: (cameras, n), the cameras and bodies to look at; False elsewhere in the result.
-        joints: (n, 17, 3) [m], world; NaN where unknown.
-        centers: (cameras, 3) [m], world.
-        directions: (cameras, detections, 17, 3) unit rays, world; NaN where not seen.
-        weights: (cameras, detections, 17); 0 where not seen.
+    `asked` (cameras, n) are those to look at; the result is False elsewhere. Joints are (n, 17, 3)
+    [m], world, NaN where unknown; cameras have centers (cameras, 3) [m], world, unit rays (cameras,
+    detections, 17, 3), NaN where not seen, and weights (cameras, detections, 17), 0 where not seen.
     """
     cameras, detections, count, _ = directions.shape
     uncovered = asked.copy()
@@ -149,10 +138,8 @@ def find_uncovered_bodies(
 class CameraGates:
     """Distances of each camera's detections to the people that they were matched with.
 
-    Attributes:
-        usual: (cameras,) medians [m]; infinite with too few matches.
-        usual_pair: median distance of the rays of two detections that are each other's nearest
-            [m]; infinite with too few.
+    `usual` (cameras,) are medians [m], and `usual_pair` is the median distance of the rays of two
+    detections that are each other's nearest [m]; infinite with too few.
     """
 
     def __init__(self, cameras: int) -> None:
@@ -193,10 +180,8 @@ class CameraGates:
 def _append(distance: Floats, known: Floats, count: Integers) -> None:
     """Write finite distances (cameras, persons) [m] behind the last ones; the oldest give way.
 
-    Args:
-        distance: distances of a frame.
-        known: (cameras, n) [m], the last n of each camera, written in turn.
-        count: (cameras,), distances so far; increased.
+    `known` (cameras, n) [m], the last n of each camera, is written in turn; `count` (cameras,)
+    grows.
     """
     for camera in range(len(known)):
         for person in range(distance.shape[1]):
@@ -309,14 +294,8 @@ def group_pairs(
 ) -> list[Sighting]:
     """Return the pairs that are likelier than their rivals, the likeliest first.
 
-    Args:
-        pairs: pairs of one frame.
-        weights: (cameras, detections, 17); 0 for matched detections.
-        settings: least number of joints.
-        least_odds: odds from which a pair counts [1].
-
-    Note:
-        Each detection joins one pair at most.
+    Each detection joins one pair at most. Weights (cameras, detections, 17) are 0 for matched
+    detections; a pair counts from odds of `least_odds` [1].
     """
     free = np.count_nonzero(weights > 0.0, axis=-1) >= settings.min_joints
     groups = []

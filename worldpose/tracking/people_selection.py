@@ -43,18 +43,10 @@ def join_people(
 ) -> tuple[list[Candidate], Chains]:
     """Return the joins of a clip's tracks and the people, without shadows and bystanders.
 
-    Tracks that are neither by themselves are accepted. Another track stays if it is joined to an
-    accepted one, the chain as a whole is no shadow, and no join of accepted tracks breaks for it.
-
-    Args:
-        tracks: tracks of the whole clip, without ghosts.
-        tracker: that made them.
-        pitch_size: length and width of the pitch around the origin [m]; None = there are no
-            bystanders.
-
-    Returns:
-        joins: joins of the tracks that stay.
-        chains: each person's tracks in time order.
+    Tracks, without ghosts, that are neither by themselves are accepted. Another track stays if it
+    is joined to an accepted one, the chain as a whole is no shadow, and no join of accepted tracks
+    breaks for it. `pitch_size` is as of `drop_bystanders`. Returned are the joins of tracks that
+    stay, and each person's tracks in time order.
     """
     settings = tracker.settings
     tracks, merged = merge_duplicates(tracks, settings.merge_distance_m)
@@ -100,13 +92,10 @@ def _select_whole(
 def drop_bystanders(
     people: list[Person], pitch_size: tuple[float, float] | None, margin: float
 ) -> list[Person]:
-    """Return the people without those who are always farther outside than `margin`.
+    """Return the people without those who are always farther outside than `margin` [m].
 
-    Args:
-        people: the clip's tracks.
-        pitch_size: length along x and width along y of the pitch around the origin [m]; None keeps
-            all.
-        margin: largest distance of a player outside of the lines [m].
+    `pitch_size` is the length along x and width along y of the pitch around the origin [m]; None
+    keeps all.
     """
     if pitch_size is None:
         return people
@@ -145,13 +134,8 @@ class LocatedFrames:
 def merge_duplicates(people: list[Person], distance: float) -> tuple[list[Person], int]:
     """Return the people without second tracks, whose detections the first ones take over.
 
-    Args:
-        people: the clip's tracks; changed.
-        distance: between bodies, below which two can be one [m], in most frames of the shorter
-            track.
-
-    Returns:
-        The other people, and the number of duplicates.
+    Bodies nearer than `distance` [m] can be one, in most frames of the shorter track. The second
+    result is the number of duplicates.
     """
     seen = {person.number: located_frames(person) for person in people}
     by_length = sorted(people, key=lambda person: (len(seen[person.number].frame), -person.number))
@@ -174,12 +158,7 @@ def _is_duplicate(track: LocatedFrames, other: LocatedFrames, distance: float) -
 
 
 def drop_shadows(people: list[Person], distance: float) -> list[Person]:
-    """Return the people without those nearly always close to a person seen by far more cameras.
-
-    Args:
-        people: the clip's tracks.
-        distance: between bodies, below which one may be the other's shadow [m]; 0 keeps all.
-    """
+    """Return the people without those that `is_shadow` calls shadows; a distance of 0 keeps all."""
     if distance <= 0.0:
         return people
     seen = [located_frames(person) for person in people]
@@ -193,10 +172,7 @@ def drop_shadows(people: list[Person], distance: float) -> list[Person]:
 def is_shadow(chain: list[LocatedFrames], others: list[LocatedFrames], distance: float) -> bool:
     """Return whether a person is nearly always close to a person seen by far more cameras.
 
-    Args:
-        chain: the person's tracks.
-        others: the tracks of all other people.
-        distance: between bodies, below which one may be the other's shadow [m].
+    `chain` are the person's tracks; a body nearer than `distance` [m] may be another's shadow.
     """
     beside = np.concatenate([_near_better_seen(track, others, distance) for track in chain])
     return bool(len(beside)) and float(beside.mean()) >= MIN_SHADOW_SHARE
@@ -231,11 +207,8 @@ def _body_distances(
 ) -> tuple[Integers, Integers, Floats]:
     """Return `_common_distances` of two tracks.
 
-    Args:
-        frame: (frames,) rising.
-        joints: (frames, 17, 3) [m], world; NaN where not determined.
-        other_frame: (others,) rising.
-        other_joints: (others, 17, 3) [m], world.
+    Frames (frames,) and (others,) rise; joints are (frames, 17, 3) and (others, 17, 3) [m], world,
+    NaN where not determined.
     """
     most = min(len(frame), len(other_frame))
     mine, theirs, apart = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most)
@@ -279,12 +252,7 @@ def people_at_births(people: list[Person]) -> dict[int, list[Person]]:
 
 
 def limit_people(people: list[Person], limit: int | None) -> list[Person]:
-    """Return the people without those beyond the limit at any time, who have the least evidence.
-
-    Args:
-        people: the clip's tracks.
-        limit: most people at once; None = any number.
-    """
+    """Return the people without those beyond the limit, if any, at a time, with least evidence."""
     if limit is None:
         return people
     kept = list(people)

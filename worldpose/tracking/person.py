@@ -24,8 +24,7 @@ class Sighting:
 
     Attributes:
         index: (cameras,) index of the detection; -1 = not seen.
-        ray_distance: (cameras,) mean distance of the detection's rays to the person [m]; NaN = not
-            seen.
+        ray_distance: (cameras,) mean distance of its rays to the person [m]; NaN = not seen.
         joints: (17, 3) [m], world; NaN where the rays do not determine them.
     """
 
@@ -239,9 +238,8 @@ def _shift_pose(
 ) -> tuple[Floats, Floats, bool, float]:
     """Update a pose with the joints of a new frame, which are NaN where unknown.
 
-    Returns:
-        The pose, in which known joints are replaced and the others shifted by the median motion of
-        the known ones; this shift (3,); whether any joint is known; the mean ray distance [m].
+    Return the pose, in which known joints are replaced and the others shifted by the median motion
+    of the known ones; this shift (3,); whether any joint is known; the mean ray distance [m].
     """
     both, known = np.empty((len(pose), 3)), False
     count = 0
@@ -268,14 +266,9 @@ def _shift_pose(
 
 @compile_kernel
 def separations(a: Floats, b: Floats) -> Floats:
-    """Return the mean distance of the joints known in both poses of every pair [m].
+    """Return mean distances (n, m) [m] of poses a (n, 17, 3) and b (m, 17, 3) [m], world.
 
-    Args:
-        a: (n, 17, 3) [m], world.
-        b: (m, 17, 3) [m], world.
-
-    Returns:
-        (n, m) [m]; infinite where no joint is known in both.
+    It is that of the joints known in both; infinite without any.
     """
     out = np.full((len(a), len(b)), np.inf)
     for n in range(len(a)):

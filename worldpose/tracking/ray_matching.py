@@ -144,11 +144,8 @@ def rays_apart(
 ) -> tuple[float, float, int]:
     """Return sums of distances [m] and of sines of two detections' rays, and their joints' number.
 
-    Args:
-        baseline: (3,) from the first camera to the second [m].
-        rays: (joints, 3) unit rays of the first; NaN where not seen.
-        others: (joints, 3) of the second.
-        most: sum of distances at which the rest does not count [m].
+    The baseline (3,) is from the first camera to the second [m]; unit rays are (joints, 3), NaN
+    where not seen. Beyond a sum of distances of `most` [m] the rest does not count.
     """
     x, y, z = baseline
     total, sines, count = 0.0, 0.0, 0
@@ -168,15 +165,11 @@ def rays_apart(
 
 @compile_kernel
 def view_distances(centers: Floats, directions: Floats, index: Integers) -> Floats:
-    """Return the mean distance of the rays of every two detections of each person.
+    """Return mean distances (persons, cameras, cameras) [m] of rays of two detections of a person.
 
-    Args:
-        centers: (cameras, 3) [m], world.
-        directions: (cameras, detections, joints, 3) unit rays, world; NaN where not seen.
-        index: (cameras, persons) index of the detection; -1 = not seen.
-
-    Returns:
-        (persons, cameras, cameras) [m]; infinite without a common joint.
+    They are infinite without a common joint. Centers are (cameras, 3) [m], unit rays (cameras,
+    detections, joints, 3), world, NaN where not seen, indices of detections (cameras, persons), or
+    -1.
     """
     cameras, persons = index.shape
     joint_count = directions.shape[2]
@@ -282,9 +275,8 @@ def match_greedily(affinity: Floats) -> Integers:
 def nearest_detections(affinity: Floats, unmatched: float) -> tuple[Integers, Flags]:
     """Return each person's best detection (cameras, persons), and the cameras where two share one.
 
-    Args:
-        affinity: (cameras, persons, detections); minus infinity = no match.
-        unmatched: affinity of a person without detection.
+    The affinity is (cameras, persons, detections), minus infinity = no match, and `unmatched` that
+    of a person without detection.
     """
     cameras, persons, detections = affinity.shape
     index, shared = np.full((cameras, persons), -1), np.zeros(cameras, np.bool_)
@@ -336,22 +328,16 @@ def intersect_people(
     gate: float,
     min_sine: float,
 ) -> Floats:
-    """Return the joints of people from the rays of their detections.
+    """Return people's joints (persons, joints, 3) [m], world, from the rays of their detections.
 
     The point nearest to the rays, each weighted by `weights` over its squared length, under a
     Geman-McClure loss: a view that shows another person has little influence.
 
-    Args:
-        centers: (cameras, 3) [m], world.
-        directions: (cameras, detections, joints, 3) unit rays, world; NaN where not seen.
-        weights: (cameras, detections, joints), of the squared angle; 0 where not seen.
-        index: (cameras, persons) index of the detection; -1 = not seen.
-        near: (persons, joints, 3) [m], predicted positions; NaN without prediction.
-        gate: distance [m] beyond which a ray is an outlier.
-        min_sine: least sine of the angle between two inlier rays.
-
-    Returns:
-        (persons, joints, 3) [m], world; NaN with fewer than two inlier rays.
+    Centers are (cameras, 3) [m] and unit rays (cameras, detections, joints, 3), world, NaN where
+    not seen; weights (cameras, detections, joints) of the squared angle are 0 there. `index`
+    (cameras, persons) is each person's detection, or -1, and `near` (persons, joints, 3) [m] are
+    predicted positions, or NaN. Beyond `gate` [m] a ray is an outlier; joints are NaN with fewer
+    than two inlier rays, or the sine of their angle below `min_sine`.
     """
     cameras, _, joint_count, _ = directions.shape
     persons = index.shape[1]

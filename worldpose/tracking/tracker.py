@@ -152,13 +152,9 @@ def _weigh(
 ) -> None:
     """Multiply confidences by the precision in the part of the image where the person is.
 
-    Args:
-        weights: (frames, cameras, detections, joints), the confidences; 0 where not seen
-            afterwards.
-        directions: (frames, cameras, detections, joints, 3); NaN where not seen afterwards.
-        image: (frames, cameras, detections, joints, 2) [px].
-        size: (cameras, 2) [px].
-        precision: (cameras, rows, columns), of angles.
+    Weights are (frames, cameras, detections, joints), directions (..., 3) of these: where not seen
+    afterwards, they are 0 and NaN. `image` has places (..., 2) [px], `size` is (cameras, 2) [px],
+    and the precision of angles (cameras, rows, columns).
     """
     frames, cameras, detections, joints = weights.shape
     _, rows, columns = precision.shape
@@ -188,11 +184,7 @@ def pixel_weights(cameras: Camera, covariance: Floats) -> Floats:
     """Return the weight (cameras, rows, columns) of people's keypoints in parts of the images [1].
 
     It is the inverse of a keypoint's variance: its own (`feet.PIXEL_STD`, `feet.PIXEL_SHARE`) and
-    the calibration's.
-
-    Args:
-        cameras: batch (cameras,).
-        covariance: (cameras, 12, 12), by `static_calibration.parameters.PARAMETERS`.
+    the calibration's (cameras, 12, 12), by `static_calibration.parameters.PARAMETERS`.
     """
     cells = (32, 18)  # Columns and rows of the parts of an image with one weight.
     columns, rows = cells

@@ -41,11 +41,7 @@ class Vertical(NamedTuple):
 
 
 def find_vertical(joints: Floats) -> Vertical | None:
-    """Return the axis along which people stand; None without a pose whose axis is known.
-
-    Args:
-        joints: (..., 17, 3), COCO-17 in any unit; NaN where missing.
-    """
+    """Return the axis along which people (..., 17, 3), in any unit, stand; None if unknown."""
     joints = joints.reshape(-1, 17, 3).astype(np.float64)
     shoulders, hips, ankles = (joints[:, [n, n + 1]].mean(axis=1) for n in (5, 11, 15))
     parts = np.stack([shoulders - hips, hips - ankles])

@@ -106,15 +106,9 @@ def train(
     """Train a net and return its checks; the net then has the weights of the best one.
 
     A check also runs before the first step: training that makes the net worse changes nothing,
-    unless the settings keep the last weights.
-
-    Args:
-        training: net, batches, loss, metric and settings.
-        checkpoint: written at every check; if the file exists, training resumes from it.
-        progress: receives a line at every check.
-
-    Raises:
-        InputError: the checkpoint is of another training.
+    unless the settings keep the last weights. The checkpoint is written at every check; if the file
+    exists, training resumes from it, or InputError if it is of another training. `progress`
+    receives a line at every check.
     """
     net, settings = training.net, training.settings
     optimizer = torch.optim.AdamW(net.parameters(), lr=settings.rate, weight_decay=settings.decay)
@@ -321,9 +315,7 @@ class FineTuned:
     Attributes:
         learned: frames in the training set.
         held_out: frames in the test set.
-        before: metric of the initial weights [1].
-        after: metric of the final weights [1].
-        steps: done.
+        before: metric of the initial weights [1]; after: that of the final weights.
         better: whether the metric rose by at least the required gain.
     """
 
@@ -346,16 +338,9 @@ def fine_tune(
 ) -> FineTuned:
     """Fine-tune a net on labels and return its metrics; the weights are written in any case.
 
-    Args:
-        kind: which net.
-        pictures: images with reviewed labels, in the order of recording.
-        weights: the file to write; with the checkpoint next to it a killed training resumes.
-        settings: the defaults if None.
-        start: initial weights; the shipped ones if None.
-        progress: receives a line at every check.
-
-    Raises:
-        InputError: too few frames, a subset without people, or weights of another net.
+    Images with reviewed labels are in the order of recording. With the checkpoint next to the file
+    of weights a killed training resumes. Weights to `start` from, None = shipped ones, are of such
+    a net. InputError for too few frames, a subset without people, or weights of another net.
     """
     settings = settings or FineTuningSettings()
     learned, checked, held_out = split(pictures, settings, kind)

@@ -124,12 +124,9 @@ def keypoint_batch(
 ) -> KeypointBatch:
     """Return a batch; the same generator gives the same one.
 
-    Args:
-        people: drawn with equal probability, from `labelled_people`.
-        cache: reads their images.
-        settings: number and augmentation of the crops.
-        rng: draws people, errors of boxes and augmentations.
-        flip: (points,) number of each point's mirror image, for labels of other points than joints.
+    People of `labelled_people` have equal probability; the generator draws them, errors of boxes
+    and augmentations. `flip` (points,) is the number of each point's mirror image, for labels of
+    other points than joints.
     """
     count = settings.crops
     crops = np.empty((count, CROP[1], CROP[0], 3), dtype=np.uint8)
@@ -291,12 +288,9 @@ def keypoint_loss(net: KeypointNet, batch: KeypointBatch) -> Tensor:
 
 
 def box_loss(batch: KeypointBatch, said: Tensor, fit: Tensor) -> Tensor:
-    """Return the loss of boxes, and of their fit, the expected overlap with any person's box.
+    """Return the loss of boxes (crops, 4) [px of the crop], and of their fit (crops,) in logits.
 
-    Args:
-        batch: the truth.
-        said: (crops, 4) [px of the crop].
-        fit: (crops,) logits.
+    The fit is the expected overlap with any person's box.
     """
     boxes, people, ignored = (
         torch.from_numpy(each).to(said.device)

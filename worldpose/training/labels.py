@@ -96,13 +96,8 @@ def read_labels(annotations: Path, pictures: Path | None = None) -> list[Labelle
     which begin at the centre of the top-left pixel. The categories name the order of keypoints;
     annotations of categories without keypoints or a name of people are left out, and said.
 
-    Args:
-        annotations: the JSON file.
-        pictures: the folder of the images; the folder of the JSON file if None.
-
-    Raises:
-        InputError: the file is no COCO keypoints data set, or an image lies outside of the folder
-            or has another size.
+    Images are in the folder `pictures`, by default that of the JSON file. InputError also if one
+    lies outside of it or has another size.
     """
     folder = annotations.parent if pictures is None else pictures
 
@@ -178,8 +173,7 @@ def _orders(
 ) -> Mapping[int | None, tuple[PointOrder, int]]:
     """Return order and number of keypoints by category of people; by None without categories.
 
-    Raises:
-        InputError: none of several categories is of people, or its keypoints are others.
+    InputError if none of several categories is of people, or its keypoints are others.
     """
     usual = order_by_names(str(path), COCO17), len(COCO17)
     people = [each for each in categories if each.is_of_people or len(categories) == 1]
@@ -203,10 +197,7 @@ def write_labels(
 ) -> None:
     """Write a COCO keypoints data set; image names are relative to the file's folder.
 
-    Args:
-        annotations: the JSON file.
-        pictures: within its folder.
-        size: width, height of the images [px].
+    Pictures within it have a width, height [px].
     """
     images: list[dict[str, Any]] = []
     people: list[dict[str, Any]] = []
@@ -294,11 +285,8 @@ def propose_labels(
 
     The folder then holds pictures/<video>_<frame>.png and labels.json, for any editor of COCO
     keypoints and for `read_labels`. The write is atomic: a failure leaves nothing that prevents a
-    retry.
-
-    Raises:
-        UsageError: the folder is not empty.
-        InputError: two videos have the same name or different sizes, or one is damaged.
+    retry. UsageError if the folder is not empty; InputError if two videos have the same name or
+    different sizes.
     """
     if folder.exists() and any(folder.iterdir()):
         todo = "Choose another folder: corrected labels are never overwritten."

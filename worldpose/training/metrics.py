@@ -22,13 +22,11 @@ MAX_ERROR_SHARE: Final = 0.05
 
 @dataclass(frozen=True)
 class KeypointMetrics:
-    """Accuracy of keypoints in given boxes.
+    """Accuracy of keypoints in given boxes of so many people.
 
     Attributes:
-        people: number of people.
         pck: share of visible keypoints within a fifth of the torso [1].
-        median_error: median error of visible keypoints, as a share of the longer side of the box
-            [1].
+        median_error: of visible keypoints, as a share of the longer side of the box [1].
         calibration: mean gap between confidence and share of correct keypoints [1].
     """
 
@@ -61,10 +59,7 @@ def stored_people(
     estimator: PoseEstimator,
     settings: DetectionSettings | None = None,
 ) -> People:
-    """Return the people in an image as the stage stores them, the crowd included.
-
-    Scores are those before `ScoreMap`.
-    """
+    """Return the people in an image as stored, crowd included, with scores before `ScoreMap`."""
     chosen = settings or DetectionSettings()
     kept = people.scores >= chosen.low_score_threshold
     people = people.select(kept)
@@ -121,12 +116,8 @@ def average_precision(
 
     As in COCO, the best boxes choose first, and each chooses the person that it overlaps most.
     Ignored people, people of other heights, and boxes on them count neither as true nor as false
-    positives. The same applies to boxes of other heights that match no person.
-
-    Args:
-        found: detections in each image.
-        labels: the truth of the same images.
-        heights: range of wanted people, lower bound included, upper not [px].
+    positives. The same applies to boxes of other heights that match no person. The range of wanted
+    heights [px] includes its lower bound, not the upper. `labels` are of the images of `found`.
     """
     scores, right = [], []
     asked = 0
@@ -182,11 +173,8 @@ def judge_boxes(people: People, picture: LabelledPicture) -> tuple[Floats, Flags
 def correct_keypoints(found: AnyFloats, true: Floats) -> Floats:
     """Return 1 for keypoints within a fifth of the torso, else 0 (people, 17); NaN without truth.
 
-    A torso is as long as the longer diagonal from a shoulder to the other side's hip.
-
-    Args:
-        found: (people, 17, 2) [px]; a missing one is not correct.
-        true: (people, 17, 2) [px]; NaN where unknown.
+    A torso is as long as the longer diagonal from a shoulder to the other side's hip. Keypoints are
+    (people, 17, 2) [px]; a missing one is not correct.
     """
     error = np.linalg.norm(found - true, axis=-1)
     torso = np.linalg.norm(true[:, (5, 6)] - true[:, (12, 11)], axis=-1).max(axis=-1)
@@ -197,10 +185,8 @@ def correct_keypoints(found: AnyFloats, true: Floats) -> Floats:
 def calibration_error(confidence: Floats, right: Flags, classes: int = 10) -> float:
     """Return the mean gap between confidence and share of correct ones [1], over equal bins.
 
-    Args:
-        confidence: (keypoints,) in (0, 1].
-        right: (keypoints,)
-        classes: bins of confidence, with equally many keypoints each.
+    Confidences (keypoints,) in (0, 1] and `right` (keypoints,) are in `classes` bins of equally
+    many.
     """
     order = np.argsort(confidence, kind="stable")
     parts = np.array_split(order, min(classes, len(order)))

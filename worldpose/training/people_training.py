@@ -173,9 +173,7 @@ def people_loss(net: PeopleNet, batch: PeopleBatch) -> Tensor:
 def box_overlap(said: Tensor, true: Tensor) -> tuple[Tensor, Tensor]:
     """Return intersection over union [1] of boxes, and the generalised one, which falls below 0.
 
-    Args:
-        said: (..., 4) x0, y0, x1, y1 [px].
-        true: (..., 4), broadcast against `said`.
+    Boxes are (..., 4) x0, y0, x1, y1 [px], and broadcast.
     """
     low, high = (
         torch.maximum(said[..., :2], true[..., :2]),

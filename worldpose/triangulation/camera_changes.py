@@ -51,7 +51,6 @@ class MeasuredChange:
 
     Attributes:
         camera: index.
-        kind: its clock or its view changed.
         row: row of the first frame after a sudden change; None = over the whole clip.
         amount: (5,) shift along x and y [px], zoom [1], roll [rad] and clock offset [frame] of the
             images after a sudden change, or at the end of the clip.
@@ -127,10 +126,7 @@ def _fit_clip(
     start: Sequence[Part],
     free: int | None = None,
 ) -> tuple[list[Part], ChangeSums]:
-    """Return parts as of `find_changes`, and sums with them taken back.
-
-    The views of a `free` camera count for nothing.
-    """
+    """Return parts as of `find_changes` and sums with them taken back, without a `free` view."""
     parts = [*(Part(c, "constant", 0, (0.0,)) for c in range(sums.cameras)), *start]
     tried = [[part.name for part in parts]]
     for _ in range(12):
@@ -182,17 +178,10 @@ def sum_clip(
     near: slice = slice(None),
     bins: tuple[int, int] | None = None,
 ) -> ChangeSums:
-    """Return the equations of people who are triangulated with parts taken back.
+    """Return the equations of people who are triangulated with parts of the detections taken back.
 
-    Args:
-        cameras: batch (cameras,).
-        people: detections of the tracked people of a clip.
-        fps: rows per second [1/s].
-        rows: rows of the clip.
-        parts: parts that are corrected in the detections.
-        settings: accepted deviations.
-        near: the rows that count.
-        bins: as of `choose_bins`; None = its own choice.
+    Cameras are a batch (cameras,), and `fps` is rows per second [1/s]. `rows` are of the clip, of
+    which those `near` count; `bins` are as of `choose_bins`; None = its own choice.
     """
     frames, half = len(rows), half_window(fps)
     length, every = bins or choose_bins(frames * people.detection_index[0].size, fps)
@@ -264,12 +253,8 @@ def refine_change(
 ) -> CameraChange:
     """Return a known change of a view with what people show who were tracked through it.
 
-    Args:
-        cameras: batch (cameras,), at least three.
-        people: detections of the tracked people of a clip, with the known change taken back.
-        fps: frames per second [1/s].
-        camera: index of the camera.
-        known: its change.
+    Cameras are a batch (cameras,), at least three, of which `camera` is the index of the changed
+    one. `people` are the tracked ones of a clip, with the known change taken back.
     """
     frame = np.asarray(people.frame, dtype=np.int64)
     parts = [Part(c, "constant", 0, (0.0,)) for c in range(len(cameras.focal))]
@@ -344,10 +329,7 @@ def correct_views(
 
 
 def _view_motion(camera: Camera, amount: Floats) -> Floats:
-    """Return the matrix (3, 3) of a turn and a zoom that change what a camera shows.
-
-    The shift [px] is that at the principal point.
-    """
+    """Return the matrix (3, 3) of a turn and a zoom that shift the principal point by pixels."""
     x, y, zoom, roll = amount[:4] / [camera.focal[0], camera.focal[1], 1.0, 1.0]
     turn = Rotation.from_rotvec([-y, x, roll]).as_matrix()
     return np.asarray([[1.0 + zoom], [1.0 + zoom], [1.0]] * turn)
@@ -356,10 +338,7 @@ def _view_motion(camera: Camera, amount: Floats) -> Floats:
 def _turn_rows(
     pixels: Floats, share: Floats, camera: Camera, amount: Floats, *, back: bool
 ) -> None:
-    """Move pixels (frames, ..., 2) in place by their shares (frames,) of a view's motion.
-
-    `back` gives the pixels that the camera had shown before its view changed.
-    """
+    """Move pixels (frames, ..., 2) in place by shares (frames,) of a view's motion, or `back`."""
     unturned = replace(camera, cam_from_world=Rigid.identity())
     for part in np.unique(share[share > 0.0]):
         rows, motion = pixels[share == part], _view_motion(camera, part * amount)

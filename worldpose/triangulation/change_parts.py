@@ -75,11 +75,7 @@ class Part:
         return WIDTH * self.camera + UNKNOWNS[self.kind]
 
     def is_usual(self, focal: float) -> bool:
-        """Return whether the size is large enough to matter, and a camera can change so.
-
-        Args:
-            focal: focal length of the camera [px].
-        """
+        """Return whether the size matters and a camera of focal length [px] can change so."""
         least = MIN_SIZE.get((self.kind, self.shape), 0.0)
         if self.kind == "clock":
             return abs(self.size[0]) >= least
@@ -259,8 +255,6 @@ class _Fit:
     """Parts, fitted to sums: the module's equations.
 
     Attributes:
-        sums: the equations.
-        parts: the parts.
         frames: of the clip.
         columns: (bins, unknowns, sizes + views), A.
         sizes: (sizes + views,), x.

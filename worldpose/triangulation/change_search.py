@@ -37,13 +37,7 @@ from worldpose.triangulation.settings import TriangulationSettings
 
 @dataclass(frozen=True, eq=False)
 class FollowedClip:
-    """A clip whose cameras change.
-
-    Attributes:
-        detections: with far knocks taken back.
-        tracks: of these detections.
-        changes: of the cameras.
-    """
+    """A clip whose cameras change: detections with far knocks taken back, and their tracks."""
 
     detections: KeypointDetections[ClipArray]
     tracks: Tracking
@@ -59,14 +53,8 @@ def follow_changes(
 ) -> FollowedClip:
     """Track people, and take far knocks of cameras back.
 
-    One camera is corrected at a time: it spoils the people that the others meet.
-
-    Args:
-        names: of the cameras.
-        cameras: batch (cameras,).
-        fps: frames per second [1/s].
-        open_detections: returns the clip with some changes of views taken back.
-        track: the tracker.
+    One camera is corrected at a time: it spoils the people that the others meet. `open_detections`
+    returns the clip with some changes of views taken back.
     """
     detections, changes = open_detections(()), list[CameraChange]()
     frame = np.asarray(detections.frame, dtype=np.int64)
@@ -224,13 +212,8 @@ def add_changes(
 ) -> tuple[list[CameraChange], list[CameraChange]]:
     """Return the known changes that stay, and the further ones that joints show.
 
-    Args:
-        known: what `follow_changes` found.
-        measured: what `find_changes` found with the known changes taken back.
-        names: of the cameras.
-        cameras: batch (cameras,).
-        frame: the clip's match frames.
-        fps: match frames per second [1/s].
+    `known` is what `follow_changes` found, `measured` what `find_changes` found with those taken
+    back. `frame` (frames,) are the clip's match frames, `fps` of them a second [1/s].
     """
     stay, new = list(known), list[CameraChange]()
     for each in measured:

@@ -48,7 +48,6 @@ class ChangeSums:
         matrix: (bins, unknowns, unknowns).
         score: (bins, unknowns).
         rows: (bins,) middle of each bin [frame].
-        fps: [1/s].
         focal: (cameras,) focal lengths [px].
         are_clocks_asked: a user asks for changes of clocks, and sees the evidence: the noise of a
             clock is that of seconds about their neighbours.
@@ -228,14 +227,9 @@ def sum_joints(
 ) -> ChangeSums:
     """Return the equations of a chunk of a clip; its first and last rows give velocities only.
 
-    Args:
-        cameras: batch (cameras,).
-        seen: detections of tracked people, (frames, cameras, detections).
-        joints: (frames, persons, 17, 3) triangulated [m], world.
-        start: row of the first of these frames in the clip.
-        fps: rows per second [1/s].
-        bins: as of `choose_bins`.
-        settings: accepted deviations.
+    `seen` has tracked people (frames, cameras, detections), joints (frames, persons, 17, 3) [m] are
+    in the world. `start` is the row of the first of these frames in the clip, at `fps` rows per
+    second; `bins` are as of `choose_bins`.
     """
     (length, every), limbs = bins, np.full_like(joints, np.nan)
     limbs[:, :, LIMBS] = joints[:, :, LIMBS]

@@ -39,12 +39,9 @@ def trace_clocks(
     follow are added, or else the clearest of the others; then the steps and drifts of all cameras
     are fitted together, until there is none.
 
-    Args:
-        cameras: batch (cameras,), at least three.
-        detections: (frames, cameras, detections) in memory, before tracking.
-        fps: frames per second [1/s].
-        late: (cameras,) constant offset to start from [frame].
-        pitch_size: length and width of the pitch that people stand on [m]; None = not known.
+    There are at least three cameras (cameras,), and detections (frames, cameras, detections) before
+    tracking, in memory. `late` (cameras,) is the constant offset to start from [frame],
+    `pitch_size` the length and width of the pitch that people stand on [m]; None = not known.
     """
     frames, count = detections.score.shape[:2]
     # Clocks may be frames apart.
@@ -127,10 +124,7 @@ def add_slow_drifts(
 def shift_by_courses(
     detections: KeypointDetections, courses: Sequence[Course]
 ) -> tuple[KeypointDetections, Floats]:
-    """Return the nearest frames on the common clock, and what is left of the offsets [frame].
-
-    Detections are (frames, cameras, detections), offsets that are left (frames, cameras).
-    """
+    """Return the nearest frames on the common clock, and offsets left (frames, cameras) [frame]."""
     frames, count = detections.score.shape[:2]
     frame = np.arange(frames)
     course = np.stack([np.interp(frame, *np.array(each).T) for each in courses], axis=1)

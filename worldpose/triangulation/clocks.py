@@ -79,12 +79,6 @@ def estimate_clocks(
     Each pass triangulates people, regresses each camera's residuals on the people's image velocity,
     with the joints free to follow, and shifts the camera's observations in time by the estimate. At
     convergence no residual correlates with velocity, so noise of the velocity has no effect.
-
-    Args:
-        cameras: batch (cameras,).
-        detections: detections of the clip, as detected.
-        fps: frames per second [1/s].
-        settings: noise, and the standard error below which an offset is determined.
     """
     rig = Rig.from_cameras(cameras)
     count = len(rig.cameras)
@@ -118,10 +112,7 @@ def estimate_clocks(
 
 
 def _standard_error(sums: PersonSums, step: Floats, inverse: Floats, unknown: float) -> Floats:
-    """Return the standard error (cameras,) [frame] of a step, the solution of summed equations.
-
-    It is `unknown` where nothing tells.
-    """
+    """Return the standard error (cameras,) [frame] of a step of summed equations, or `unknown`."""
     information = sums.information
     # Cameras without information are not part of the mean.
     telling = np.diagonal(information.sum(axis=0)) > 1.0 / unknown**2
@@ -176,14 +167,13 @@ class PersonSums:
 
 @dataclass(frozen=True, eq=False)
 class MovingJoints:
-    """Triangulated joints of an interval of frames, and what each camera sees of them.
+    """Triangulated joints of an interval of frames, and what each camera of a rig sees of them.
 
     Attributes:
         at: (n, 3) [m], world.
         velocity: (n, 3) [m/frame].
         person: (n,).
         frame: (n,).
-        rig: the cameras.
     """
 
     at: Floats
@@ -313,19 +303,13 @@ def _eliminate_points(
 ) -> None:
     """Add normal equations of cameras by group, with each point free to follow.
 
-    With P, C the derivatives by point and camera, m the miss, w the weight, in views c and d:
-    H_cd = [c = d] w C^T C - X_c V^-1 X_d^T and g_c = w C^T m - X_c V^-1 (sum w P^T m), where
-    X = w C^T P and V = sum w P^T P.
+    With P, C the derivatives by point and camera, m the miss, w the weight, in views c and d: H_cd
+    = [c = d] w C^T C - X_c V^-1 X_d^T and g_c = w C^T m - X_c V^-1 (sum w P^T m), where X = w C^T P
+    and V = sum w P^T P.
 
-    Args:
-        place: (n, cameras) row of a point's view in the next four; -1 = none.
-        group: (n,).
-        by_point: (rows, 2, 3).
-        columns: (rows, 2, k).
-        miss: (rows, 2) [px].
-        weight: (rows,) [1/px^2].
-        information: (groups, cameras, k, cameras, k), added to.
-        score: (groups, cameras, k), added to.
+    `place` (n, cameras) is a point's row, -1 = none, in `by_point` (rows, 2, 3), `columns` (rows,
+    2, k), `miss` (rows, 2) [px] and `weight` (rows,) [1/px^2]; `group` is (n,). Added to are
+    `information` (groups, cameras, k, cameras, k) and `score` (groups, cameras, k).
     """
     cameras, width = place.shape[1], columns.shape[2]
     mixed, follows = np.empty((cameras, width, 3)), np.empty((cameras, width, 3))
@@ -373,10 +357,8 @@ def read_frames(
 ) -> KeypointDetections:
     """Return the detections of some frames of a clip, on the common clock.
 
-    Args:
-        detections: detections of the clip, as detected.
-        frames: range from a first frame to before a last frame, or single frames.
-        late: (cameras,) [frame], clock offsets to correct; None = no correction.
+    Frames are a range or single ones. Clock offsets `late` (cameras,) [frame] are corrected; None =
+    no correction.
     """
     offsets = np.zeros(1) if late is None else np.nan_to_num(late)
     reach = math.ceil(float(np.abs(offsets).max(initial=0.0)))
@@ -401,17 +383,12 @@ def read_frames(
 
 
 def shift_in_time(detections: KeypointDetections, late: Floats) -> KeypointDetections:
-    """Return the detections shifted to the common clock, one per person and camera.
+    """Return the uncorrected detections shifted to the common clock, one per person and camera.
 
-    Keypoints are interpolated linearly between two frames and are missing unless both have them.
-
-    Args:
-        detections: detections before any correction.
-        late: (cameras,) or (cameras, frames) [frame]; NaN or 0 leaves a camera as it is.
-
-    Returns:
-        Keypoints (frames, cameras, persons, joints, 2), confidence, and the matching index; so are
-        the points besides COCO-17.
+    Keypoints, also those besides COCO-17, are interpolated linearly between two frames and are
+    missing unless both have them: (frames, cameras, persons, joints, 2), with confidence and the
+    matching index. Offsets `late` are (cameras,) or (cameras, frames) [frame]; NaN or 0 leaves a
+    camera as it is.
     """
     frames, _, persons = detections.detection_index.shape
     row, camera_row, _ = np.ogrid[:frames, : detections.detection_index.shape[1], :persons]
@@ -447,16 +424,14 @@ def shift_in_time(detections: KeypointDetections, late: Floats) -> KeypointDetec
 
 
 def move_to_match_time(pixels: Floats, index: NDArray[np.integer], late: Floats) -> Floats:
-    """Return keypoints of tracked people as they are at the match frames.
+    """Return keypoints (frames, cameras, detections, points, 2) [px] of people at the match frames.
 
     A keypoint moves along the line to the same person's in a neighbouring frame: x(f) = x + share
     (x' - x), where the camera's frames show the match times f + late and f' + late'. The neighbour
     on the other side of f counts, or else the one on the same side; without any, x stays.
 
-    Args:
-        pixels: (frames, cameras, detections, points, 2) [px].
-        index: (frames, cameras, persons), each person's detection; -1 = not seen.
-        late: (frames, cameras), how much later than its match frame each frame is [frame].
+    `index` (frames, cameras, persons) is each person's detection, -1 = not seen; `late` (frames,
+    cameras) is how much later than its match frame each frame is [frame].
     """
     moved, frames = pixels.copy(), len(index)
     frame = np.arange(frames)[:, None]

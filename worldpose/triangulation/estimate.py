@@ -114,15 +114,7 @@ def learn_clip(
     settings: TriangulationSettings,
     camera_covariance: Floats | None = None,
 ) -> ClipModel:
-    """Return the clip's model, learned from sample frames.
-
-    Args:
-        cameras: batch (cameras,).
-        detections: detections of the clip.
-        fps: frames per second [1/s].
-        settings: settings of the stage.
-        camera_covariance: (cameras, 12, 12) covariance as in `triangulate_joints`.
-    """
+    """Return the clip's model, learned from sample frames; arguments as of `reconstruct_joints`."""
     clocks = estimate_clocks(cameras, detections, fps, settings)
     late = clocks.late if settings.correct_clocks else None
     joints, there = detections.confidence.shape[-1], have_views(detections, settings.min_views)
@@ -157,16 +149,9 @@ def reconstruct_chunks(
     """Yield a clip's joints, one chunk of `length` frames at a time.
 
     Triangulated joints equal those of the whole clip at once, smoothed joints to within 0.1 mm.
-
-    Args:
-        cameras: batch (cameras,).
-        detections: detections of the clip, as detected.
-        model: model of the clip, from `learn_clip`.
-        fps: frames per second [1/s].
-        settings: settings of the stage.
-        camera_covariance: (cameras, 12, 12) covariance as in `triangulate_joints`.
-        length: frames per chunk; rounded up to the margin and whole tiles of the solver.
-        stride: only every such frame is computed; a chunk's `frames` count those.
+    Arguments are as of `reconstruct_joints`, and the model is from `learn_clip`. `length` is
+    rounded up to the margin and whole tiles of the solver; only every `stride`-th frame is
+    computed, and a chunk's `frames` count those.
     """
     every = np.arange(0, detections.confidence.shape[0], stride)
     frames, fps = len(every), fps / stride
@@ -459,11 +444,7 @@ def _join_halves(
 def check_shapes(
     cameras: Camera, detections: KeypointDetections, camera_covariance: Floats | None
 ) -> None:
-    """Require arrays of matching shapes, and valid indices.
-
-    Raises:
-        InputError: shapes do not match, or an index is invalid.
-    """
+    """Raise InputError unless arrays have matching shapes, and indices are valid."""
     require_clip("triangulation", cameras, detections, tracked=True)
     detection_index = detections.detection_index
     if camera_covariance is not None and camera_covariance.shape != (*cameras.batch_shape, 12, 12):

@@ -61,14 +61,9 @@ def find_swaps(
     """Return the left-right swaps of body parts (frames, cameras, persons, parts).
 
     Each detection is compared, as it is and with the whole body or parts of it swapped, by the
-    distances to the joints from all views, under a loss truncated at `limit`. Only detections with
-    at least two outlier keypoints are tested.
-
-    Args:
-        observations: observations of all tracked people.
-        noise: [px], [m].
-        limit: largest squared error of an inlier [variances].
-        found: the joints from the unchanged detections.
+    distances to the joints from all views, under a loss truncated at the largest squared error of
+    an inlier, `limit` [variances]. Only detections with at least two outlier keypoints are tested.
+    `noise` is [px], [m], and `found` has the joints from the unchanged detections.
     """
     exchanged = np.zeros((*observations.detection_index.shape, len(EXCHANGED_PARTS)), np.bool_)
     if observations.precision.shape[-1] == len(COCO17):
@@ -239,13 +234,8 @@ def repair_limb_lengths(
     """Re-triangulate, in place, ends with few inlier views of limbs of wrong length.
 
     For the two limbs of an arm or leg together, the pairs of views with the smallest residuals of
-    all views and limb lengths decide. If the limb still has a wrong length, its end is missing.
-
-    Args:
-        observations: observations of all tracked people.
-        settings: noise, inlier limit and minimum views.
-        found: joints of the same observations; changed.
-        lengths: (persons, limbs) lengths of `limb_lengths`.
+    all views and limb lengths (persons, limbs) [m] decide. If the limb still has a wrong length,
+    its end is missing. `found` has the joints of the same observations.
     """
     if found.joints.shape[2] != len(COCO17):
         return

@@ -96,10 +96,8 @@ class _Meetings:
     """Detections of a camera and the people whom all cameras track.
 
     Attributes:
-        camera: one camera.
         seen: (frames, detections, 2) middles of torsos [px].
         people: (frames, persons, 3) middles of torsos [m], world.
-        fps: frames per second [1/s].
     """
 
     camera: Camera

@@ -26,14 +26,9 @@ def replace_joints(
 ) -> tuple[Triangulation, Smoothing]:
     """Return both results with the paper's joints, each frame on its own and all views alike.
 
-    Joints that we do not determine stay missing. The paper has no covariance: ours stays.
-
-    Args:
-        cameras: batch (cameras,).
-        detections: of the tracked people in these frames.
-        found: our joints, the start.
-        smooth: our joints over time.
-        about_mid_hip: shift the images of a person so that the mid-hips meet.
+    Joints that we do not determine stay missing. The paper has no covariance: ours stays. Our
+    joints `found` are the start; if `about_mid_hip`, the images of a person are shifted until
+    mid-hips meet.
     """
     joints = place_joints(cameras, detections, found.joints, about_mid_hip=about_mid_hip)
     unfilled = np.zeros_like(smooth.filled)

@@ -68,12 +68,9 @@ def stated_errors(
 ) -> StatedErrors:
     """Return the variance of each person's position in each image.
 
-    Args:
-        cameras: batch (cameras,).
-        joints: (frames, persons, joints, 3) [m], world; their mean is the person's position.
-        settings: `calibration_error_m` replaces a missing covariance.
-        camera_covariance: (cameras, 12, 12) covariance of steps in the order of `PARAMETERS`, or
-            None.
+    A person's position is the mean of the joints (frames, persons, joints, 3) [m], world. The
+    covariance (cameras, 12, 12) is of steps in the order of `PARAMETERS`; `calibration_error_m`
+    replaces a missing one.
     """
     found = np.isfinite(joints[..., 0])
     number = np.maximum(found.sum(axis=-1), 1)[..., None]
@@ -226,16 +223,11 @@ def _solve_bodies(
 ) -> None:
     """Minimize E_body of each person; the joints are eliminated (Schur complement).
 
-    Args:
-        observations: observations of all tracked people, without a shift.
-        noise: [px], [m].
-        first: joints and inliers without offsets.
-        prior: (frames, cameras, persons) tau^2 [px^2].
-        buffers: buffers of the kernel.
-        offsets: (frames, cameras, persons, 2) [px], written.
-        variance: (frames, cameras, persons) [px^2] per axis, of the offsets, written.
-        further: (frames, persons, joints, 3, 3) [m^2], contribution of the offsets to the joints'
-            covariance, written; no frames = not wanted.
+    Observations have no shift; noise is [px], [m]; `first` has joints and inliers without offsets,
+    and `prior` tau^2 (frames, cameras, persons) [px^2]. Written are `offsets` (frames, cameras,
+    persons, 2) [px], their `variance` per axis (frames, cameras, persons) [px^2], and `further`
+    (frames, persons, joints, 3, 3) [m^2], their contribution to the joints' covariance; no frames =
+    not wanted.
     """
     frames, count, persons = observations.detection_index.shape
     joint_count = observations.precision.shape[3]
@@ -287,13 +279,10 @@ def _solve_bodies(
 def _assign_unknowns(
     inliers: NDArray[np.bool_], prior: Floats, tiles: Tiles, slot: NDArray[np.int64]
 ) -> int:
-    """Mark a person's inliers (cameras, joints) as used; return the number of unknowns.
+    """Mark a person's inliers (cameras, joints) as `used` in tiles; return the number of unknowns.
 
-    Args:
-        inliers: (cameras, joints).
-        prior: (cameras,) [px^2].
-        tiles: (cameras,) tiles of the person; `used` is written.
-        slot: (cameras,) place of a camera's two unknowns, written; -1 = none.
+    The prior is (cameras,) [px^2]; `slot` (cameras,) is written, the place of a camera's two
+    unknowns, -1 = none.
     """
     size = 0
     for c in range(len(tiles)):
@@ -321,16 +310,10 @@ def _add_view(
     at: int,
     equations: _Equations,
 ) -> None:
-    """Add one view of a joint to the equations of its camera's offset.
+    """Add one view of joint j to the equations of its camera's offset.
 
-    Args:
-        tile: observations of the camera.
-        p: (4,) depth of the camera.
-        noise: [px], [m].
-        j: the joint.
-        point: (3,) [m], its position.
-        at: place of the camera's unknowns.
-        equations: `mixed` is written, the others are added to.
+    The camera has depth p (4,), the noise is [px], [m], and the joint's point is (3,) [m]. The
+    camera's unknowns are from place `at` on; `mixed` is written, the other equations are added to.
     """
     h, right, w = equations.matrix, equations.right, equations.mixed
     x, y, z = point

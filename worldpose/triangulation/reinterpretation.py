@@ -49,14 +49,9 @@ def reinterpret_calibration(
 ) -> tuple[Mapping[str, CameraCalibration], list[str]]:
     """Return cameras for images of another size if people agree at it alone, and what was done.
 
-    Args:
-        calibration: the file, for messages.
-        cameras: its cameras, by which no two of them agree on their people.
-        detections: (frames, cameras, detections) in memory.
-        agree: whether people agree in a batch of cameras.
-
-    Raises:
-        InputError: people agree if the poses mean something else than the form says.
+    By the cameras of the file, no two of them agree on their people (frames, cameras, detections).
+    `agree` says whether people agree in a batch of cameras. InputError if they do when the poses
+    mean something else than the form says.
     """
 
     def stack(given: Mapping[str, CameraCalibration]) -> Camera:
@@ -108,10 +103,7 @@ def reinterpret_calibration(
 
 
 def _reach(detections: KeypointDetections) -> Floats:
-    """Return how far right and down keypoints are in each camera (cameras, 2) [px]; 0 = none.
-
-    Detectors guess some keypoints beyond the border.
-    """
+    """Return how far right and down keypoints are in each camera (cameras, 2) [px]; 0 = none."""
     inside = 0.98  # share of keypoints within the image [1]
     reach = np.zeros((detections.keypoints.shape[1], 2))
     for camera in range(len(reach)):

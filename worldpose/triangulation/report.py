@@ -97,8 +97,7 @@ class Agreement:
     """Counts and histograms behind a triangulation report.
 
     Attributes:
-        found: joints.
-        undetermined: joints seen but not found.
+        found: joints; undetermined: joints seen but not found.
         seen: observations.
         views: inlier views, summed over all joints.
         used: (cameras,) observations of joints found.
@@ -177,13 +176,7 @@ def _by_camera(there: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 @dataclass(frozen=True, eq=False)
 class Changes:
-    """Counts and distances behind a smoothing report.
-
-    Attributes:
-        there: joints after smoothing.
-        filled: number of filled joints among these.
-        moved: distances from the triangulated joints [m].
-    """
+    """Joints after smoothing, those `filled` among them, and their distances `moved` by it [m]."""
 
     there: int
     filled: int

@@ -202,12 +202,10 @@ class Buffers(NamedTuple):
 
 @compile_kernel
 def read_tile(observations: Observations, first: int, tiles: Tiles) -> None:
-    """Write the linearised observations of 64 joints by all cameras.
+    """Write `a`, `b`, `scale`, `precision`, `extra` of 64 joints in the tiles (cameras,).
 
-    Args:
-        observations: observations of all joints.
-        first: the first joint, counted over frames, persons, joints.
-        tiles: (cameras,), written: `a`, `b`, `scale`, `precision`, `extra`.
+    They are linearised observations. `first` is the first joint, counted over frames, persons,
+    joints.
     """
     for camera in range(len(tiles)):
         _gather(observations, first, camera, tiles[camera])
@@ -255,10 +253,7 @@ def _gather(observations: Observations, first: int, camera: int, tile: Tile) -> 
 
 @compile_kernel
 def _linearize(tile: Tile, cameras: Floats, camera: int) -> None:
-    """Turn the pixels of one of the cameras into equations.
-
-    Observations are dropped where the lens model has no inverse, and for a missing camera.
-    """
+    """Turn a camera's pixels into equations, but those where the camera or lens gives no ray."""
     a, b, scale, precision = tile["a"], tile["b"], tile["scale"], tile["precision"]
     if not is_finite(cameras, camera):
         a[:], b[:], scale[:], precision[:] = 0.0, 0.0, 0.0, 0.0

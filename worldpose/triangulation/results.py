@@ -169,11 +169,9 @@ def add_margins(
 
 @dataclass(frozen=True, eq=False)
 class MotionModel:
-    """Motion prior of smoothing.
+    """Motion prior: standard deviation (joints,) of accelerations per axis [m/s^2].
 
-    Attributes:
-        acceleration: (joints,) standard deviation per axis [m/s^2].
-        repeated: frames whose errors count as one, at least 1.
+    Errors of `repeated` frames, at least 1, count as one.
     """
 
     acceleration: Floats
@@ -212,7 +210,6 @@ class ClipModel:
         clocks: clock offsets of the cameras.
         corrected: (cameras,) [frame], the offsets to correct; None = none, by the settings.
         detector: error model of detector and calibration.
-        motion: motion prior of smoothing.
     """
 
     clocks: CameraClocks
@@ -223,13 +220,7 @@ class ClipModel:
 
 @dataclass(frozen=True, eq=False)
 class Chunk:
-    """Joints of one chunk of frames.
-
-    Attributes:
-        frames: its place among the computed frames of the clip.
-        triangulation: joints of each frame on its own.
-        smoothing: joints as parts of whole tracks.
-    """
+    """Joints of a chunk: its place among the computed frames, and both results."""
 
     frames: slice
     triangulation: Triangulation

@@ -22,9 +22,7 @@ def have_views(detections: KeypointDetections[ClipArray], views: int) -> Flags:
 def sample_frames(there: Flags, joints: int) -> NDArray[np.int64]:
     """Return frames to learn from: all over those with people, and some of each person.
 
-    Args:
-        there: (frames, persons), as of `have_views`.
-        joints: number of joints of a person.
+    `there` (frames, persons) is as of `have_views`, with so many joints per person.
     """
     present = there.sum(axis=1)
     busy = np.flatnonzero(present)
@@ -59,9 +57,7 @@ def choose_intervals(there: Flags, length: int) -> list[slice]:
 def choose_stretches(there: NDArray[np.bool_], fps: float) -> list[tuple[int, slice]]:
     """Return persons and intervals of frames to learn from, spread over the clip.
 
-    Args:
-        there: (frames, persons), whether the person can be triangulated.
-        fps: frames per second [1/s].
+    `there` (frames, persons) is whether the person can be triangulated.
     """
     frames, persons = there.shape
     # Length of an interval [s].

@@ -40,18 +40,11 @@ def learn_motion(
     fps: float,
     settings: TriangulationSettings,
 ) -> MotionModel:
-    """Return the accelerations that predict held-out cameras best.
+    """Return the accelerations that predict held-out cameras best, by intervals of one person.
 
     Joints are smoothed from every other camera and compared with the observations of the held-out
     cameras. This penalizes too much smoothing as well as too little. Errors that a detector repeats
     from frame to frame differ between cameras, so they do not count as motion.
-
-    Args:
-        rig: the cameras.
-        tracks: intervals of one person each.
-        joints: number of joints per person.
-        fps: frames per second [1/s].
-        settings: noise and inlier limit.
     """
     names = [name.split("_")[-1] for name in COCO17]
     limit, noise = settings.max_deviation**2, settings.noise

@@ -119,13 +119,8 @@ def _write_joints(
 ) -> None:
     """Write the joints that their views determine, and in `found` (lanes,) which these are.
 
-    Args:
-        state: joints with their covariance and statistics.
-        place: (joints, 3), frame, person and joint of each lane.
-        min_views: minimum inlier views.
-        min_sine: minimum sine of the widest angle between their rays.
-        solved: written.
-        found: written.
+    `place` (joints, 3) has frame, person and joint of each lane, and `min_sine` is the least sine
+    of the widest angle between the rays of at least `min_views` inliers.
     """
     point, matrix = state["point"], state["matrix"]
     pixels, inliers, spread = state["pixels"], state["views"], state["spread"]
@@ -152,16 +147,11 @@ def find_consensus(rig: Rig, noise: tuple[float, float], limit: float, buffers: 
     """Write the least-squares points of the inlier views, NaN where there are none.
 
     The first attempt uses all views. If they disagree, a Geman-McClure loss whose scale shrinks
-    from the largest error to `limit` finds a majority (graduated non-convexity, Blake and Zisserman
-    1987). Without a majority, the pair of views with the smallest error over all views decides. The
-    result is the plain least-squares point of the views within `limit`.
-
-    Args:
-        rig: the cameras.
-        noise: [px], [m].
-        limit: largest squared error of an inlier [variances].
-        buffers: tiles, whose `used` is written, and state: written are the points, and the inverse
-            matrices there.
+    from the largest error to `limit` [variances] finds a majority (graduated non-convexity, Blake
+    and Zisserman 1987). Without a majority, the pair of views with the smallest error over all
+    views decides. The result is the plain least-squares point of the views within `limit`. The
+    noise is [px], [m]; of the buffers, the tiles' `used`, the points and the inverse matrices are
+    written.
     """
     tiles, state = buffers.tiles, buffers.state[0]
     for tile in tiles:
@@ -199,7 +189,7 @@ def find_consensus(rig: Rig, noise: tuple[float, float], limit: float, buffers: 
 def _graduate(
     tiles: Tiles, depths: Floats, noise: tuple[float, float], limit: float, state: State
 ) -> bool:
-    """Move joints with disagreeing views to a majority's point; return whether there are any.
+    """Move joints whose views disagree to a majority's point; return whether there are any.
 
     Their loss scale ends at `limit`; the loss scale of all other joints is infinite.
     """
@@ -304,10 +294,7 @@ def take_step(tiles: Tiles, depths: Floats, noise: tuple[float, float], state: S
 
 @compile_kernel
 def _move(state: State) -> None:
-    """Add the solution of the equations to the points; the matrix becomes its inverse.
-
-    The inverse is NaN where the matrix is singular to working precision.
-    """
+    """Add the solution of the equations to the points; the matrix becomes its inverse or NaN."""
     matrix, right, point, length = state["matrix"], state["right"], state["point"], state["step"]
     for j in range(LANES):
         a, b, c = matrix[0, j], matrix[1, j], matrix[2, j]

@@ -85,15 +85,9 @@ def synchronize(
     places on the pitch are compared (`estimate_plane_clocks`). A camera that shows no motion, or no
     person whom another shows, has no offset.
 
-    Args:
-        cameras: batch (cameras,).
-        detections: (frames, cameras, detections) in memory, before tracking.
-        fps: frames per second [1/s].
-        max_offset_s: largest offset between two cameras [s]; at most half of the clip.
-        pitch: the pitch that people stand on; None = they may be anywhere.
-
-    Raises:
-        InputError: fewer than two cameras, or shapes that do not fit together.
+    Detections (frames, cameras, detections) are in memory, before tracking. Two cameras differ by
+    `max_offset_s` [s] at most, and by half of the clip. People stand on the pitch; None = anywhere.
+    InputError for fewer than two cameras, or shapes that do not fit together.
     """
     require_clip("synchronization", cameras, detections, least=2)
     confidence, count = detections.confidence, len(cameras.focal)
@@ -275,10 +269,8 @@ def shift_frames(
 ) -> KeypointDetections:
     """Return detections of some cameras on the common clock, shifted by whole frames.
 
-    Args:
-        detections: (frames, cameras, detections).
-        chosen: (n,) the cameras.
-        late: (n,) [frame], frame t shows the time t + late.
+    Detections are (frames, cameras, detections); frame t of the chosen cameras (n,) shows the time
+    t + late, with `late` (n,) [frame].
     """
     frames = len(detections.keypoints)
     arrays = {}
@@ -406,10 +398,7 @@ class _Table:
     def _join(
         self, curves: dict[tuple[int, int], Floats], drawn: dict[tuple[int, int], Floats]
     ) -> tuple[list[list[int]], Integers, list[str]]:
-        """Return groups of cameras, each in the order of clearness, their offsets, and reasons.
-
-        A camera that joins no group can begin another one.
-        """
+        """Return groups of cameras in the order of clearness, their offsets, and reasons."""
         late = np.zeros(self.count, dtype=np.int64)
         reasons = [
             "no offset stands out: its people move too little, or no other camera shows them"

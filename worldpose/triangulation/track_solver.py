@@ -54,15 +54,10 @@ def select_person(
     person: int,
     frames: slice = slice(None),
 ) -> PersonKeypoints:
-    """Return one person's keypoints.
+    """Return one person's keypoints in the frames to include.
 
-    Args:
-        detections: detections of all people.
-        precision: (frames, cameras, detections, joints) precision of the keypoints.
-        offsets: (frames, cameras, persons, 2) [px] to subtract.
-        joints: (frames, persons, joints, 3) [m], triangulated.
-        person: index of the person.
-        frames: frames to include.
+    Precision is (frames, cameras, detections, joints), offsets to subtract (frames, cameras,
+    persons, 2) [px], triangulated joints (frames, persons, joints, 3) [m].
     """
     index = detections.detection_index[frames, :, person]
     # Whole rows of joints: `take_along_axis` would index every number, at ten times the time.
@@ -82,7 +77,7 @@ class TrackCosts(NamedTuple):
     """Weights of errors of observations and of accelerations.
 
     Attributes:
-        noise: noise of observations, [px] and [m].
+        noise: of observations, [px] and [m].
         limit: scale of the Geman-McClure loss of observations [variances].
         penalty: on squared second differences [1/m^2].
     """
@@ -142,15 +137,9 @@ def _solve_track(
 ) -> None:
     """Minimize E_track over the points of a track.
 
-    Observations have a Geman-McClure loss of scale `costs.limit`.
-
-    Args:
-        tiles: tiles of `prepare_tiles`.
-        depths: (cameras, 4).
-        costs: weights of errors.
-        state: (1,) room for a state.
-        points: (frames, 3) [m], initial values; written.
-        covariance: (frames, 3, 3) [m^2], written.
+    Observations have a Geman-McClure loss of scale `costs.limit`. Depths are (cameras, 4), and
+    `state` (1,) is room for one. `points` (frames, 3) [m] are initial values, written as is
+    `covariance` (frames, 3, 3) [m^2].
     """
     frames = len(points)
     size = 3 * frames

@@ -55,7 +55,6 @@ class Walkers(NamedTuple):
     Attributes:
         joints: (frames, persons, 17, 3) in any unit; NaN where missing.
         frames: (frames,) rows of the clip.
-        fps: frames per second [1/s].
     """
 
     joints: Floats
@@ -228,14 +227,8 @@ class People(NamedTuple):
 def find_people(cameras: Camera, detections: KeypointDetections, fps: float) -> Found:
     """Return what the people in the cameras' images tell of their world, whatever its unit.
 
-    Args:
-        cameras: batch (cameras,).
-        detections: (frames, cameras, detections) in memory.
-        fps: frames per second [1/s].
-
-    Returns:
-        people: None if they tell nothing.
-        agree: whether two cameras agree on their people.
+    Detections are (frames, cameras, detections) in memory. `people` are None if they tell nothing,
+    and `agree` is whether two cameras agree on their people.
     """
     longest, settings = 250, TrackingSettings()
     detections = detections[select_busiest_frames(detections.confidence, longest)]
@@ -287,10 +280,7 @@ def doubt_sides(people: People) -> str:
 def doubt_world(cameras: Camera, people: People, *, sizes: bool = True) -> list[str]:
     """Return sentences about a world in which people do not stand along z, or are no adults.
 
-    Args:
-        cameras: batch (cameras,).
-        people: tracked people, in metres.
-        sizes: whether lengths can be judged.
+    Tracked people are in metres; `sizes` is whether lengths can be judged.
     """
     vertical, size = people.vertical, doubt_statures(people.statures) if sizes else ""
     said = [each for each in (size, doubt_sides(people)) if each]
@@ -311,11 +301,7 @@ class StatedWorld(NamedTuple):
 
 
 def read_stated_world(unit: str | None, up: str | None) -> StatedWorld:
-    """Return what the options `--unit` and `--up` state.
-
-    Raises:
-        UsageError: they are no unit, or no axis.
-    """
+    """Return what the options `--unit` and `--up` state; UsageError if that is no unit or axis."""
     axes = {f"{sign}{'xyz'[n]}": f"{sign}1" for sign in ("", "-") for n in range(3)}
     unit_m, axis = None, None
     try:
@@ -354,21 +340,13 @@ def place_cameras(
 ) -> Placed:
     """Return cameras in a world in metres with z up, and sentences about what was changed.
 
-    What the user states holds. The rest follows from the people: their stature tells the unit,
-    and the axis along which they stand, with the ground on which they walk, the vertical. A world
-    that is turned has its ground at z = 0, and keeps its heading.
+    What the user states holds. The rest follows from the people: their stature tells the unit, and
+    the axis along which they stand, with the ground on which they walk, the vertical. A world that
+    is turned has its ground at z = 0, and keeps its heading.
 
-    Args:
-        calibration: the calibration, whose form tells its unit.
-        cameras: cameras as read.
-        detections: 2D poses of these cameras on a common clock; none = unknown.
-        fps: frames per second [1/s].
-        stated: what the user states.
-
-    Raises:
-        UsageError: there is no camera that has the stated world.
-        InputError: people have no size of people in any unit, or cameras without people are too
-            far apart for metres.
+    The form of the calibration tells its unit. 2D poses are on a common clock; none = unknown.
+    UsageError if no camera has the stated world; InputError if people have no size of people in any
+    unit, or cameras without people are too far apart for metres.
     """
     if not cameras:
         if stated.unit_m is not None or stated.up is not None:

@@ -27,10 +27,8 @@ from worldpose.video.pictures import MAX_FRAME_PIXELS, FrameIndex, Pictures, con
 def open_file(path: Path, form: str | None = None) -> InputContainer:
     """Open a file whose frames decode only within `MAX_FRAME_PIXELS`, whatever its header says.
 
-    Threads keep one frame each, so that large frames get few of them.
-
-    Raises:
-        InputError: the file is a list of other files, which can be outside of its folder.
+    Threads keep one frame each, so that large frames get few of them. InputError if the file is a
+    list of other files, which can be outside of its folder.
     """
     limit = {"max_pixels": str(MAX_FRAME_PIXELS)}
     local = {"protocol_whitelist": "file"}
@@ -65,10 +63,8 @@ def holds_video(path: Path) -> bool:
 def index_frames(path: Path) -> FrameIndex:
     """Return the index of a file's first video stream, from its packets: it decodes one frame.
 
-    It decodes all frames of a file whose packets do not say when each frame is shown.
-
-    Raises:
-        InputError: no video, frames without time stamps, or stamps that start again.
+    It decodes all frames of a file whose packets do not say when each frame is shown. InputError
+    for no video, frames without time stamps, or stamps that start again.
     """
     try:
         with open_file(path) as container:
@@ -271,15 +267,7 @@ class VideoReader(Pictures):
     """A video file with access to frames by number, forwards without seeking."""
 
     def __init__(self, path: Path, index: FrameIndex | None = None) -> None:
-        """Open a file.
-
-        Args:
-            path: the video.
-            index: index of the video; if None, it is computed.
-
-        Raises:
-            InputError: no video.
-        """
+        """Open a file, with its index or a computed one; InputError if it is no video."""
         self.path = path
         self.index = index_frames(path) if index is None else index
         self._number = {int(stamp): number for number, stamp in enumerate(self.index.stamps)}
@@ -309,17 +297,8 @@ class VideoReader(Pictures):
         """Yield frames as `frames` does, with None for each damaged or undecodable one.
 
         Frames after a damaged one up to the next key frame are None too: they may be predicted from
-        it.
-
-        Args:
-            start: first frame.
-            stop: one past the last; the end of the video if None.
-            grey: luma instead of RGB.
-            width: RGB images get this width, before rotation [px]; None = unscaled.
-            only: frames to yield; the others are decoded, but not converted. None = all.
-
-        Raises:
-            InputError: there are no such frames, or one has another size than the first.
+        it. RGB images get `width`, before rotation [px]; None = unscaled. Frames that are not in
+        `only` are decoded, but not converted; None = all. InputError also if one has another size.
         """
         stop = len(self) if stop is None else stop
         if not 0 <= start <= stop <= len(self):
@@ -443,16 +422,9 @@ class VideoReader(Pictures):
 def write_video(path: Path, pictures: Iterable[Image], fps: float, *, quality: int = 20) -> int:
     """Write images to a file and return their number; the same images give the same bytes.
 
-    H.264 with a key frame per second if the installed FFmpeg can write it, else MPEG-4 part 2.
-
-    Args:
-        path: .mp4, written image by image.
-        pictures: (height, width, 3) RGB, or (height, width) grey, all of one even size.
-        fps: frames per second.
-        quality: 0 is without loss, 51 the worst (H.264's constant rate factor).
-
-    Raises:
-        InputError: no image, or one of another or an odd size.
+    H.264 with a key frame per second if the installed FFmpeg can write it, else MPEG-4 part 2, of
+    (height, width, 3) RGB, or (height, width) grey. A quality of 0 is without loss, 51 the worst
+    (H.264's constant rate factor). InputError for no image, or one of another or an odd size.
     """
     rate = Fraction(fps).limit_denominator(1001)
     codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"

@@ -27,15 +27,10 @@ MAX_PIXELS: Final = 200_000_000
 
 
 def decode_image(content: Image, *, grey: bool = False, turned: bool = True) -> Image | None:
-    """Return an image (height, width, 3) RGB, or (height, width) grey.
+    """Return an image (height, width, 3) RGB, or (height, width) grey, of a file of `FORMATS`.
 
-    Args:
-        content: (bytes,) content of an image file of `FORMATS`.
-        grey: without colour.
-        turned: as its EXIF tag says that it is shown, not as it is stored.
-
-    Returns:
-        None if the bytes are no whole image, or declare more than `MAX_PIXELS`.
+    It is `turned` as its EXIF tag says that it is shown, or as it is stored. None if the content
+    (bytes,) is no whole image, or declares more than `MAX_PIXELS`.
     """
     import cv2  # late: it takes 0.2 s, and few commands open an image
 
@@ -76,15 +71,7 @@ class ImageFolder(Pictures):
     """Images whose names have their number; the lowest is frame 0, a gap a missing frame."""
 
     def __init__(self, folder: Path, index: FrameIndex | None = None) -> None:
-        """Open a folder.
-
-        Args:
-            folder: holds the images.
-            index: index of the images; if None, it is computed.
-
-        Raises:
-            InputError: no images, or names without a number or with the same one.
-        """
+        """Open a folder of images, with its index or one of `index_images`."""
         self.path = folder
         self._files = [file for _, file in numbered_images(folder)]
         self.index = index_images(folder) if index is None else index
@@ -118,10 +105,8 @@ class ImageFolder(Pictures):
 def numbered_images(folder: Path) -> list[tuple[int, Path]]:
     """Return the images of a folder by the numbers at the ends of their names, or else in these.
 
-    `frame_numbers` finds the latter, as in `img (7).png` of Windows.
-
-    Raises:
-        InputError: no images, or names without a number or with the same one.
+    `frame_numbers` finds the latter, as in `img (7).png` of Windows. InputError for no images, or
+    names without a number or with the same one.
     """
     files = sorted(
         file
@@ -144,11 +129,7 @@ def numbered_images(folder: Path) -> list[tuple[int, Path]]:
 
 
 def index_images(folder: Path) -> FrameIndex:
-    """Return the index of a folder of images; the size comes from the first one.
-
-    Raises:
-        InputError: no images, or names without a number or with the same one.
-    """
+    """Return the index of a folder as of `numbered_images`; the size comes from the first one."""
     images = numbered_images(folder)
     stamps = np.array([number for number, _ in images], dtype=np.int64)
     first = _read(images[0][1], grey=True)
@@ -182,12 +163,7 @@ def _read(file: Path, *, grey: bool) -> Image | None:
 def some_pictures(
     video: VideoReader | ImageFolder, numbers: NDArray[np.integer]
 ) -> Iterator[tuple[int, Image | None]]:
-    """Yield selected frames in order; None where one cannot be decoded.
-
-    Args:
-        video: their source.
-        numbers: (pictures,) rising.
-    """
+    """Yield frames of rising numbers (pictures,); None where one cannot be decoded."""
     for group in jumps(numbers, video.index.key):
         only = set(group.tolist())
         yield from video.readable(int(group[0]), int(group[-1]) + 1, only=only)
@@ -209,10 +185,8 @@ def readable_at(
 ) -> Iterator[Image | None]:
     """Yield the frame of each number; None for a negative one, and where none can be decoded.
 
-    Args:
-        video: their source.
-        numbers: (pictures,) with repetitions; decoding begins again where they go back.
-        grey: as of `Pictures.frames`.
+    Numbers (pictures,) may repeat; decoding begins again where they go back. Grey is as of
+    `Pictures.frames`.
     """
     only = set(numbers.tolist())
     end = max(only, default=0) + 1
@@ -237,9 +211,7 @@ def grey_on_clock(path: Path, numbers: Integers, fps: float) -> Iterator[Image]:
 def jumps(numbers: NDArray[np.integer], key: Flags) -> list[NDArray[np.integer]]:
     """Return groups of frames, each decoded in one pass.
 
-    Args:
-        numbers: (pictures,) selected, rising.
-        key: (all pictures,) whether decoding can begin there.
+    Selected numbers (pictures,) rise; at `key` (all pictures,) decoding can begin.
     """
     if not len(numbers):
         return []
@@ -253,15 +225,10 @@ def jumps(numbers: NDArray[np.integer], key: Flags) -> list[NDArray[np.integer]]
 def median_picture(frames: Iterable[Image], most: int = 64) -> Image:
     """Return the median of a clip's frames, which shows no moving people.
 
-    At most `most` frames are in memory, evenly spread over the clip: when the limit is reached, the
-    function drops every second frame and doubles the stride.
-
-    Args:
-        frames: (height, width) or (height, width, 3) each, of one camera that does not move.
-        most: maximum number of frames in memory, two or more.
-
-    Raises:
-        InputError: there are no frames, their sizes differ, or `most` is below two.
+    At most `most` frames, two or more, are in memory, evenly spread over the clip: when the limit
+    is reached, the function drops every second frame and doubles the stride. Frames of a camera
+    that does not move are (height, width) or (height, width, 3). InputError for none, or other
+    sizes.
     """
     band = 64  # rows, which stay in the processor's cache
     if most < 2:

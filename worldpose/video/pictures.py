@@ -72,10 +72,8 @@ class FrameIndex:
 
         Frame n is shown n / fps after the first one. A frame that a recorder dropped, or a pause,
         leaves its clock frames empty and shifts no later one; of two video frames for one clock
-        frame the nearer counts.
-
-        Raises:
-            InputError: the video has another rate or none, or implausibly many frames.
+        frame the nearer counts. InputError if the video has another rate or none, or too many
+        frames.
         """
         most = 10_000_000  # two days at 60 frames/s: one wrong stamp would fill memory
         if self.time_base is None:
@@ -163,15 +161,10 @@ class Pictures(ABC):
     def frames(
         self, start: int = 0, stop: int | None = None, *, grey: bool = False
     ) -> Iterator[tuple[int, Image]]:
-        """Yield frame numbers from `start` up to before `stop`, each with its image.
+        """Yield frame numbers from `start` up to before `stop`, or the end, each with its image.
 
-        Args:
-            start: first frame.
-            stop: one past the last; the end of the video if None.
-            grey: luma (height, width) as stored, in half the time, instead of RGB.
-
-        Raises:
-            InputError: there are no such frames, or one cannot be decoded.
+        Grey is luma (height, width) as stored, in half the time, instead of RGB. InputError if
+        there are no such frames, or one cannot be decoded.
         """
         for number, picture in self.readable(start, stop, grey=grey):
             if picture is None:

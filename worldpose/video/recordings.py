@@ -24,11 +24,7 @@ from worldpose.video.pictures import FrameIndex, convert_pixels
 
 
 def join_videos(parts: Sequence[Path], out: Path) -> None:
-    """Write the chapters of one recording as one file, without re-encoding.
-
-    Raises:
-        InputError: no video, chapters that differ, or a file that does not hold all frames.
-    """
+    """Write chapters of one recording as one file, not encoded again; InputError if they differ."""
     if parts[0].suffix.lower() == ".vob":  # parts of one stream, cut between any two packets
         index_frames(parts[0])  # what is wrong with all of them is said of a file of the user
         with out.open("wb") as whole:
@@ -70,22 +66,11 @@ def join_videos(parts: Sequence[Path], out: Path) -> None:
 
 
 def cut_video(path: Path, start: int, stop: int, out: Path) -> int:
-    """Write a range of frames of a video without re-encoding.
+    """Write frames from `start` to before `stop` of a video to a file of its kind, as encoded.
 
     Decoding begins at key frames: the file also holds some frames before the first one wanted, and
-    perhaps some after the last one, from which others are predicted.
-
-    Args:
-        path: the video.
-        start: number of the first frame.
-        stop: one past the last.
-        out: the file to write, of the same kind.
-
-    Returns:
-        The number of frame `start` in the new file.
-
-    Raises:
-        InputError: no video, or it has no such frames.
+    perhaps some after the last one, from which others are predicted. Return the number of frame
+    `start` in the new file; InputError if the video has no such frames.
     """
     index = index_frames(path)
     if not 0 <= start < stop <= len(index):

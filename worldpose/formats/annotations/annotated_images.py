@@ -34,17 +34,10 @@ class ContentError(ValueError):
 def decode_file(
     path: Path, limit: int, decode: Callable[[bytes], Content], expected: str, todo: str
 ) -> Content:
-    """Return what `decode` makes of a file.
+    """Return what `decode` makes of a file of at most `limit` bytes.
 
-    Args:
-        path: the file.
-        limit: maximum size [byte].
-        decode: raises ContentError or pydantic's error for a bad content.
-        expected: what the file should be, for messages.
-        todo: what to do about another file, for messages.
-
-    Raises:
-        InputError: the file is unreadable, too large, or invalid.
+    It raises ContentError or pydantic's error for a bad content; messages say what the file should
+    be, `expected`, and what `todo` about another one.
     """
     try:
         size = path.stat().st_size
@@ -75,9 +68,7 @@ class AnnotatedPerson:
         box: (4,) x0, y0, x1, y1 [px]; (0, 0) is the centre of the top-left pixel.
         keypoints: (17, 2) COCO-17 [px]; NaN if missing.
         visible: (17,) int8: 2 visible, 1 hidden, 0 missing.
-        detection: the person's index among the camera's detections of the frame; None if an
-            annotator added the person.
-        origin: source of the annotation.
+        detection: index among the camera's detections of the frame; None if an annotator's person.
         score: the detector's confidence [1]; None if there is none.
     """
 
@@ -91,13 +82,7 @@ class AnnotatedPerson:
 
 @dataclass(frozen=True, eq=False)
 class AnnotatedImage:
-    """One image and the people in it.
-
-    Attributes:
-        name: file name; `/` between folders.
-        size: width, height [px].
-        people: people in arbitrary order.
-    """
+    """One image and the people in it; `name` has `/` for folders, `size` is width, height [px]."""
 
     name: str
     size: tuple[int, int]
@@ -105,11 +90,7 @@ class AnnotatedImage:
 
 
 def hull(keypoints: Floats) -> Floats:
-    """Return the box (4,) around a person's keypoints [px], for a person without a box.
-
-    Args:
-        keypoints: (17, 2) [px], at least one of them not NaN.
-    """
+    """Return the box (4,) [px] around a person's keypoints (17, 2) [px], of which one is known."""
     there = keypoints[np.isfinite(keypoints).all(axis=1)]
     return np.concatenate([there.min(axis=0), there.max(axis=0)])
 

@@ -42,7 +42,6 @@ class MarkedImage:
     """Labelled shapes in one image.
 
     Attributes:
-        name: name of the image, as the file has it.
         size: width, height [px]; None where the file has shares of them in place of pixels.
         points: label and (2,) pixel of every click, in the order of the file.
         lines: label and (points, 2) pixels of every drawn line.

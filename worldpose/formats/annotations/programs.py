@@ -58,13 +58,10 @@ def cvat_bytes(pictures: Sequence[AnnotatedImage]) -> bytes:
 
 
 def read_cvat(content: bytes) -> list[AnnotatedImage]:
-    """Read the images of a CVAT for images file, in its order.
+    """Read the images of a CVAT for images file, in its order; ContentError if it is none.
 
     A skeleton and a box of one detection or one group are one person; a skeleton alone has the box
     around its points. Shapes of other kinds or labels are ignored.
-
-    Raises:
-        ContentError: the file has another format, or a shape is invalid.
     """
     root = read_xml(content)
     if root.tag != "annotations":
@@ -277,13 +274,10 @@ def label_studio_bytes(pictures: Sequence[AnnotatedImage]) -> bytes:
 
 
 def read_label_studio(content: bytes) -> list[AnnotatedImage]:
-    """Read the images of a Label Studio export, in its order.
+    """Read the images of a Label Studio export, in its order; ContentError if it is none.
 
     For each task the last annotation that was not cancelled is used, or else the last prediction. A
     keypoint belongs to its parent rectangle, or else to the only one around it.
-
-    Raises:
-        ContentError: the file has another format, or a region is invalid.
     """
     return [_read(task) for task in TypeAdapter(tuple[_Task, ...]).validate_json(content)]
 

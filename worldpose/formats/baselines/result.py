@@ -27,17 +27,12 @@ from worldpose.pickles import read_pickle
 def write_tracks(
     path: Path, boxes: NDArray[np.float64], ids: NDArray[np.int64], number: NDArray[np.integer]
 ) -> None:
-    """Write boxes as a MOTChallenge text, whole or not at all.
+    """Write boxes (frames, persons, 4) x0 y0 x1 y1 [px], NaN if absent, as a MOTChallenge text.
 
     One line for each person and image: image from 1, id, left, top, width, height [px] and
     confidence 1, then three times -1. In that format, (1, 1) is the top-left corner of the top-left
-    pixel.
-
-    Args:
-        path: the file.
-        boxes: (frames, persons, 4) x0 y0 x1 y1 [px]; NaN if a person is not in the image.
-        ids: (persons,), renumbered from 1.
-        number: (frames,) number of each frame's image in its video, from 0.
+    pixel. `ids` (persons,) are renumbered from 1; `number` (frames,) counts a video's images from
+    0.
     """
     frames, people = np.nonzero(np.isfinite(boxes).all(-1))
     found = boxes[frames, people]
@@ -52,22 +47,12 @@ def write_tracks(
 
 
 def write_slahmr_cameras(path: Path, camera: Camera) -> None:
-    """Write `cameras.npz` as SLAHMR reads it, for its variant with true cameras.
+    """Write `cameras.npz` of a camera (frames,) as SLAHMR reads it, to use true cameras.
 
     Members: `height`, `width`, `focal` [px], `intrins` (frames, 4) fx fy cx cy [px] and `w2c`
     (frames, 4, 4), in world axes with y down: x as in the world, z along the world's y. The method
-    has no distortion model.
-
-    Args:
-        path: the file.
-        camera: (frames,).
-
-    Raises:
-        InputError: a frame has no camera.
-
-    Note:
-        Layout as read by vye16/slahmr at commit 58518fe, slahmr/data/dataset.py
-        (`load_cameras_npz`).
+    has no distortion model. InputError if a frame has no camera. Layout as read by vye16/slahmr at
+    commit 58518fe, slahmr/data/dataset.py (`load_cameras_npz`).
     """
     missing = np.flatnonzero(np.isnan(camera.numbers).any(-1))
     if len(missing):
@@ -147,23 +132,14 @@ class MethodTrack:
 
 @dataclass
 class Poser:
-    """Poses the bodies of a result with a body model.
-
-    Attributes:
-        model: the body model.
-        notes: notes of the result, among them the source of the shape.
-        image_size: that of the result [px].
-    """
+    """Poses the bodies of a result with a body model; `image_size` is the result's [px]."""
 
     model: BodyModel
     notes: dict[str, str] = field(default_factory=dict)
     image_size: tuple[float, float] | None = None
 
     def joints(self, track: MethodTrack, shape: Shape, place: Place = "transl") -> Floats:
-        """Return the joints (frames, 17, 3) [m] of one person.
-
-        The betas are used if the model is the body of `shape`.
-        """
+        """Return a person's joints (frames, 17, 3) [m], with betas if the model is `shape`'s."""
         model, count = self.model, len(track.frames)
         pose = np.zeros((count, 69))
         pose[:, : track.body_pose.shape[-1]] = track.body_pose
@@ -232,10 +208,8 @@ def merge_people(
 def project_boxes(joints: Floats, focal: Floats, center: Floats) -> Floats:
     """Return boxes (frames, 4) x0 y0 x1 y1 [px] around one person's joints in an image.
 
-    Args:
-        joints: (frames, 17, 3) [m], camera axes; those behind the camera are ignored.
-        focal: (2,) or (frames, 2) [px].
-        center: (2,) or (frames, 2) principal point [px].
+    Joints (frames, 17, 3) [m] are in camera axes, those behind the camera are ignored; the focal
+    length and the principal point [px] are (2,) or (frames, 2).
     """
     ahead = joints[..., 2:] > 0.0
     depth = np.where(ahead, joints[..., 2:], np.nan)
@@ -254,15 +228,10 @@ def boxes_around(pixels: Floats) -> Floats:
 
 
 def resample_result(result: MethodResult, seen_fps: float, fps: float) -> MethodResult:
-    """Return a result at its clip's frames, with linear interpolation of joints and boxes.
+    """Return a result of images at `seen_fps` at its clip's frames at `fps`, linearly interpolated.
 
-    The first images of both are simultaneous. If either of the two images around a frame
-    lacks a person, the frame lacks the person, too.
-
-    Args:
-        result: its frames count the images of the method's input.
-        seen_fps: frame rate of those images [1/s].
-        fps: frame rate of the clip [1/s].
+    The first images of both are simultaneous. If either of the two images around a frame lacks a
+    person, the frame lacks the person, too.
     """
     if seen_fps == fps or not len(result.joints.frames):
         return result
@@ -310,9 +279,6 @@ def read_pickled(path: Path) -> Part:
     """Return the content of a file: dictionaries, lists, numbers, text and arrays.
 
     `worldpose.pickles` reads pickles, also of joblib, numpy and torch, and runs nothing in them.
-
-    Raises:
-        InputError: the file is not readable, or names classes that no result needs.
     """
     try:
         content = read_pickle(path)
@@ -329,10 +295,7 @@ def read_pickled(path: Path) -> Part:
 
 @dataclass(frozen=True)
 class Part:
-    """A value in a method's file, with its place for messages.
-
-    All methods raise InputError, with the place, for a value of another form.
-    """
+    """A value in a method's file, with its place, which errors name for a value of another form."""
 
     where: str
     value: Any

@@ -46,7 +46,6 @@ class ArrowFactor:
     """Factor of an arrow matrix.
 
     Attributes:
-        band: factor of the band.
         border: (frames, n, shared)
         answer: (frames, n, shared) B^-1 E.
         reduced: (shared, shared) Schur complement.
@@ -59,10 +58,7 @@ class ArrowFactor:
 
     @classmethod
     def of(cls, system: ArrowSystem, damping: float = 0.0) -> ArrowFactor:
-        """Return the factor of a matrix whose diagonal is multiplied by 1 + damping.
-
-        It is invalid where `determined` is false.
-        """
+        """Return the factor with the diagonal times 1 + damping, invalid unless `determined`."""
         blocks, n = system.blocks.copy(), system.right.shape[1]
         blocks[0][:, range(n), range(n)] *= 1.0 + damping
         band = BandedFactor.of(blocks, overwrite=True)
@@ -89,10 +85,6 @@ class ArrowFactor:
         return np.asarray(np.linalg.inv(0.5 * (self.reduced + self.reduced.T)))
 
     def frame_covariance(self, shared: Floats) -> Floats:
-        """Return the covariance (frames, n, n) of each frame's parameters.
-
-        Args:
-            shared: covariance (shared, shared) of the shared parameters.
-        """
+        """Return covariances (frames, n, n) of frames by that of shared ones (shared, shared)."""
         spread = self.answer @ shared @ np.swapaxes(self.answer, -1, -2)
         return np.asarray(self.band.inverse_blocks() + spread)

@@ -27,11 +27,9 @@ class BandedFactor:
 
     @classmethod
     def of(cls, blocks: Floats, *, overwrite: bool = False) -> BandedFactor:
-        """Return the factor of the matrix with these lower blocks.
+        """Return the factor of the matrix with these lower blocks, whose memory it may overwrite.
 
-        Args:
-            blocks: (3, frames, n, n); `blocks[k, t]` stands in block row t + k, column t.
-            overwrite: whether the factor may take the memory of `blocks`.
+        Of blocks (3, frames, n, n), `blocks[k, t]` stands in block row t + k, column t.
         """
         lower = np.ascontiguousarray(blocks)
         if lower is blocks and not overwrite:

@@ -8,12 +8,10 @@ from worldpose.compiled import compile_kernel
 
 @compile_kernel
 def solve_in_place(normal: Floats, right: Floats, min_pivot: float) -> float:
-    """Replace `right` by the solution; return the last unknown's information, 0 if singular.
+    """Replace `right` (n,) by the solution; return the last unknown's information, 0 if singular.
 
-    Args:
-        normal: (n, n) positive definite; its lower half is overwritten by the factor L D L^T.
-        right: (n,); part of the way to the solution if singular.
-        min_pivot: pivot up to which the matrix counts as singular.
+    `normal` (n, n) is positive definite; its lower half is overwritten by the factor L D L^T. Up to
+    a pivot of `min_pivot` it counts as singular, and `right` is part of the way to the solution.
     """
     size = len(right)
     for a in range(size):

@@ -47,13 +47,9 @@ class Damping(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Minimum(Generic[S]):
-    """Result of the loop.
+    """State of minimum cost, and costs at the start and after every accepted step.
 
-    Attributes:
-        state: state of minimum cost.
-        costs: at the start and after every accepted step.
-        iterations: number of steps tried.
-        converged: whether the stopping rule ended the loop.
+    So many steps were tried; `converged` is whether the stopping rule ended the loop.
     """
 
     state: S
@@ -83,15 +79,10 @@ def minimize(
     iterations: int,
     converged: Callable[[S, S], bool],
 ) -> Minimum[S]:
-    """Return the state of minimum cost near a start.
+    """Return the state of minimum cost near a start of finite cost, in so many steps at most.
 
-    Args:
-        state: the start, of finite cost.
-        step: returns the state after a damped step from a state.
-        course: damping.
-        iterations: maximum number of steps, accepted or rejected.
-        converged: whether the states before and after a trial step end the loop; the loop asks
-            for rejected steps, too.
+    `step` returns the state after a damped step from a state. `converged` tells from the states
+    before and after a trial step, also a rejected one, whether the loop ends.
     """
     damping, costs, done, iteration = course.start, [state.cost], False, 0
     while iteration < iterations and not done and damping <= course.highest:

@@ -65,10 +65,7 @@ def find_paint(
     """Yield the paint of an image, once for every lens that it may have, the likely one first.
 
     `picture` (height, width, 3) is RGB. Without the lens, the distortion is the one that makes the
-    most paint straight. Messages begin with `where`.
-
-    Raises:
-        InputError: the image has no color or shows no grass.
+    most paint straight. InputError, with `where`, if the image has no color or shows no grass.
     """
     widths = (1280, 1920)  # far lines of a wide view stay one pixel wide
     if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:

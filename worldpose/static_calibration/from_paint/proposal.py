@@ -66,13 +66,7 @@ _TO_CLICK: Final = "Click four or more named points of this camera, such as corn
 
 @dataclass(frozen=True)
 class MarkingSupport:
-    """How much of one marking the image shows.
-
-    Attributes:
-        name: line or arc of the template.
-        visible_px: length of the marking in the straight copy of the image [px].
-        found: share of it on paint [1].
-    """
+    """One marking, its visible length in the straight copy [px], and its share on paint [1]."""
 
     name: str
     visible_px: float
@@ -108,11 +102,9 @@ class Proposal:
         return self.margin >= MIN_MARGIN and enough
 
     def require_clear(self, where: str, pitch: PitchTemplate) -> None:
-        """Refuse a proposal that may not be used without a click.
+        """Raise InputError, with what to click, for a proposal that is not clear without a click.
 
-        Raises:
-            InputError: the image shows too little, or other cameras explain it nearly as well; the
-                message says what is missing and what to click.
+        Then the image shows too little, or other cameras explain it nearly as well.
         """
         if self.is_clear:
             return
@@ -243,10 +235,9 @@ def propose_camera(
 def propose_from_paint(
     paints: Iterable[PaintMap], pitch: PitchTemplate, *, side: Side
 ) -> Proposal | None:
-    """Return the camera that explains the paint of an image best, or None.
+    """Return the camera at a side of the pitch that explains the paint of an image best, or None.
 
-    The paint is that under every lens that the image may have, the likely one first. The camera
-    stands on a side of the pitch.
+    The paint is that under every lens that the image may have, the likely one first.
     """
     found = rank_under_lenses(paints, pitch, CameraPrior().beside(pitch.spec), None)
     return None if found is None else _propose_first(found, pitch, side)
@@ -346,8 +337,8 @@ def _trace_thin_markings(
 ) -> tuple[DrawnMarking, ...]:
     """Return pixels on the markings whose paint is too thin for the search of painted lines.
 
-    Without them nothing holds the camera beyond the last line that was found: on two real cameras
-    the far touch line was 3.6 px off, 1.1 m on the ground.
+    They hold the camera beyond the last line found: on two real cameras the far touch line was 3.6
+    px off without them, 1.1 m on the ground.
     """
     lines = calibration.report.lines
     if lines is None or not lines.refined:

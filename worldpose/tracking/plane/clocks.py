@@ -51,12 +51,7 @@ def estimate_plane_clocks(
     Each camera tracks its people alone. Two cameras' tracks of one person differ by the velocity
     times the clock offset, and by the disagreement of the two calibrations, which is an affine map
     here. Of a long clip, two cameras are compared in the part in which they share most people.
-
-    Args:
-        positions: the clip's foot positions.
-        fps: frames per second [1/s].
-        pitch_size: length and width of the pitch [m].
-        max_offset_s: largest offset between two cameras [s].
+    `pitch_size` is the length and width of the pitch [m], `max_offset_s` the largest offset [s].
     """
     cameras = positions.xy.shape[1]
     longest = round((30.0 + 2.0 * max_offset_s) * fps)

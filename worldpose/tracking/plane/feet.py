@@ -114,10 +114,7 @@ class GroundPositions:
 
     @classmethod
     def join(cls, parts: Sequence[GroundPositions], length: int) -> GroundPositions:
-        """Return the frames of several parts of `length` frames, the last of which may be shorter.
-
-        Each part keeps its own number of detections.
-        """
+        """Return the frames of parts of `length` frames, each with its own number of detections."""
         names = set.intersection(*({*part.arrays()} for part in parts))
         return cls(
             **{name: FrameBlocks([getattr(p, name) for p in parts], length) for name in names}
@@ -151,12 +148,9 @@ def locate_feet(
     there to the nearer foot: a lifted foot seems farther away. The middle of the box's lower edge
     gives a second place; the result is the mean of both, or the one that is known.
 
-    Args:
-        cameras: batch (cameras,).
-        detections: (frames, cameras, detections); without a box, the ankles alone tell the place.
-        pitch: surface under the feet.
-        camera_covariance: (cameras, 12, 12) covariance of the calibration; None = exact.
-        chosen: (frames, cameras, detections), detections to locate; the others are NaN. None = all.
+    Detections are (frames, cameras, detections); the `chosen` ones, of the same shape, are located,
+    the others are NaN; None = all. The covariance of the calibration is (cameras, 12, 12); None =
+    exact.
     """
     keypoints, confidence, boxes = detections.keypoints, detections.confidence, detections.boxes
     shape = detections.score.shape
@@ -264,12 +258,9 @@ def count_covering_cameras(
 ) -> NDArray[np.int64] | FrameBlocks:
     """Return how many cameras should see the person of each detection, the own one included.
 
-    A camera should if the whole person is in its image, and not much smaller than in the camera
-    that has the detection. Other people may stand in between.
-
-    Args:
-        cameras: batch (cameras,).
-        positions: places (frames, cameras, detections).
+    Places are (frames, cameras, detections). A camera should if the whole person is in its image,
+    and not much smaller than in the camera that has the detection. Other people may stand in
+    between.
     """
     if isinstance(positions.xy, FrameBlocks):
         return positions.xy.apply(lambda part: _count_covering(cameras, part))

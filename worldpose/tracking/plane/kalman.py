@@ -160,12 +160,8 @@ def compare(
 ) -> tuple[Floats, Floats]:
     """Return squared Mahalanobis distances and log determinants (tracks, sights).
 
-    Args:
-        states: (tracks, 4), predicted.
-        covariance: (tracks, 4, 4), of them.
-        places: (sights, 2) [m], seen `clock` [s] later.
-        noise: (sights, 2, 2) [m^2], of these places.
-        clock: time of the image minus time of the frame [s].
+    Predicted states (tracks, 4) have a covariance (tracks, 4, 4), places (sights, 2) [m], seen
+    `clock` [s] after the frame, a noise (sights, 2, 2) [m^2].
     """
     squared, size = np.empty((len(states), len(places))), np.empty((len(states), len(places)))
     for t in range(len(states)):

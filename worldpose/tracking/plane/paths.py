@@ -22,10 +22,9 @@ DOUBLE_DISTANCE: Final = 1.0
 
 @dataclass(frozen=True, eq=False)
 class PlanePath:
-    """A smoothed track.
+    """A smoothed track from frame `first` on.
 
     Attributes:
-        first: first frame.
         state: (frames, 4) state of the track, place and velocity [m, m/s].
         covariance: (frames, 4, 4).
         index: frame to camera to detection.

@@ -28,13 +28,9 @@ def measure_shirts(
     """Return the colours of people's upper bodies (people, 3) [CIELAB]; NaN where hidden.
 
     Samples within the box of a person who stands nearer to the camera do not count. A person whom a
-    side of the image cuts off has no colour: the trunk is not where the keypoints put it.
-
-    Args:
-        image: (height, width, 3) RGB.
-        keypoints: (people, 17, 2) [px].
-        confidence: (people, 17).
-        boxes: (people, 4) x0, y0, x1, y1 [px]; NaN rows are no people.
+    side of the image cuts off has no colour: the trunk is not where the keypoints put it. The image
+    is (height, width, 3) RGB, keypoints are (people, 17, 2) [px] with confidence (people, 17), and
+    boxes (people, 4) x0, y0, x1, y1 [px]; NaN rows are no people.
     """
     import cv2  # late: it takes 0.2 s, and planning a run does not need it
 
@@ -92,10 +88,7 @@ def _sample(keypoints: AnyFloats, confidence: AnyFloats, box: AnyFloats) -> Floa
 
 
 class ShirtMemory:
-    """Colour of one person in one camera: the median of the last sightings.
-
-    One of them may show the background.
-    """
+    """Colour of a person in a camera: the last sightings' median; one may show the background."""
 
     def __init__(self) -> None:
         # A person's colour is the median over so many sightings.
@@ -131,10 +124,8 @@ class ShirtModel:
         """Return the statistics of one camera's clip; None with too few colours.
 
         One person's variation is that between mutual nearest neighbours of two frames in sequence.
-
-        Args:
-            shirts: (frames, detections, 3) [CIELAB]; NaN where not known.
-            xy: (frames, detections, 2) places [m]; NaN where not known.
+        Colours are (frames, detections, 3) [CIELAB], places (frames, detections, 2) [m]; NaN where
+        unknown.
         """
         known = np.asarray(np.isfinite(shirts).all(axis=-1) & np.isfinite(xy).all(axis=-1))
         changes = [np.empty((0, 3))]
@@ -160,10 +151,7 @@ class ShirtModel:
         return cls(2.0 * np.maximum(spread, LEAST_STD), everyone[chosen])
 
     def same_person(self, memory: ShirtMemory | None, shirts: Floats) -> Floats:
-        """Return log odds (n,) that colours (n, 3) are those of a person and not of anyone.
-
-        Zero where the person's colour or the other one is not known.
-        """
+        """Return log odds (n,) that colours (n, 3) are a person's, not anyone's; 0 if unknown."""
         result = np.zeros(len(shirts))
         known = np.isfinite(shirts).all(axis=-1)
         colour = None if memory is None else memory.colour

@@ -36,7 +36,7 @@ TRIANGULATED_NOISE: Final = np.diag([0.15**2, 0.15**2])
 
 @dataclass(frozen=True, eq=False)
 class TriangulatedPeople:
-    """People of a clip who are triangulated in some frames; plane tracks may continue them.
+    """People triangulated in some frames, which plane tracks may continue.
 
     Attributes:
         xy: (frames, persons, 2) [m], world, mid-hip; NaN where not triangulated.
@@ -93,19 +93,13 @@ def track_on_plane(
 
     A triangulated person is a track as well, which takes the detections near it and continues where
     triangulation ends. A track by feet that meets a person who begins to be triangulated becomes
-    that person's.
+    that person's. The positions are then NaN where a detection is a triangulated person's.
 
-    Args:
-        positions: the clip's foot positions; with `triangulated`, NaN where a detection is theirs.
-        fps: frames per second [1/s].
-        clock_s: time of each camera's image minus time of the frame [s]; None = all cameras are
-            synchronous.
-        pitch_size: length and width of the pitch [m].
-        margin_m: people always farther outside than this are bystanders [m]; assistants run within
-            a metre of the lines.
-        triangulated: people who are triangulated in some frames; None = none.
-        covering: (frames, cameras, detections), cameras that should see a person there; None =
-            not known. People seen by few of them are dropped.
+    `clock_s` is the time of each camera's image minus that of the frame [s], None = all cameras are
+    synchronous; `pitch_size` is the length and width of the pitch [m]. People always farther than
+    `margin_m` [m] outside are bystanders; assistants run within a metre of the lines. `covering`
+    (frames, cameras, detections) counts cameras that should see a person there: people seen by few
+    of them are dropped; None = not known.
     """
     frames, cameras = positions.xy.shape[:2]
     clocks = np.zeros(cameras) if clock_s is None else np.asarray(clock_s, dtype=np.float64)
@@ -193,13 +187,9 @@ def locate_tracks(
 ) -> GroundTracks:
     """Return smoothed places of people whose detections are known.
 
-    Args:
-        positions: the clip's foot positions.
-        detection_index: (frames, cameras, persons), each person's detection; -1 = not seen.
-        fps: frames per second [1/s].
-        clock_s: as in `track_on_plane`.
-        triangulated_xy: (frames, persons, 2) [m], where the same people are triangulated; NaN
-            elsewhere. None = nowhere.
+    `detection_index` (frames, cameras, persons) is each person's, -1 = not seen; `clock_s` is as in
+    `track_on_plane`. `triangulated_xy` (frames, persons, 2) [m] is of the same people, NaN or None
+    where they are not triangulated.
     """
     cameras, persons = detection_index.shape[1:]
     clocks = np.zeros(cameras) if clock_s is None else np.asarray(clock_s, dtype=np.float64)
@@ -231,9 +221,8 @@ def locate_tracks(
 def find_given_people(given: Floats, boxes: AnyFloats) -> NDArray[np.int64]:
     """Return the detection of each given person (frames, persons); -1 = none at the person's box.
 
-    Args:
-        given: (frames, persons, 4) [px], boxes of known people; NaN when absent.
-        boxes: (frames, detections, 4) [px].
+    Known people's boxes are (frames, persons, 4), NaN when absent, all boxes (frames, detections,
+    4) [px].
     """
     index = np.full(given.shape[:2], -1, dtype=np.int64)
     least = 0.3  # Least intersection over union of a person's given box and the detection's [1].
