@@ -79,6 +79,19 @@ def test_no_entry_of_a_release_changes(tmp_path, monkeypatch):
         outputs.own_whole(tmp_path, {"kinds.json": draft}, "B", (owner,), overwrite=False)
 
 
+def test_lens_errors_are_of_cameras_and_kinds_of_clips(tmp_path):
+    for name in ("kinds.json", "lens_errors.json"):
+        (tmp_path / name).write_text('{"A": {"max_error_px": 1.0}}')
+    outputs.record_owner(tmp_path, {"lens_errors.json": None}, "m")  # as an older version did
+    draft = tmp_path / "draft.json"
+    draft.write_text('{"A": {"max_error_px": 2.0}}')
+    options = {"overwrite": False, "cameras": "A"}
+    outputs.own_whole(tmp_path, {"kinds.json": draft}, "B", ("m",), **options)
+    with pytest.raises(InputError, match="clip or camera of this name"):
+        outputs.own_whole(tmp_path, {"lens_errors.json": draft}, "B", ("other",), **options)
+    outputs.own_whole(tmp_path, {"lens_errors.json": draft}, "B", ("m",), **options)
+
+
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("form", EXPORTS)
 def test_strange_results_are_written_or_refused(match_folder, tmp_path, form, case):
