@@ -181,7 +181,7 @@ def test_an_export_of_ones_own_holds_the_ways_of_all_people(
 
 def test_a_detector_of_ones_own_gives_poses_that_an_import_takes(script, tmp_path):
     match, poses = tmp_path / "match", tmp_path / "poses"
-    scenario = ("--scenario", "tiny", "--seed", 2, "--duration", 0.08, "--cameras", 2)
+    scenario = ("--scenario", "tiny", "--seed", 2, "--duration", 0.2, "--cameras", 2)
     succeed("simulate", *scenario, "--render", "--no-stills", "--out", match)
     for camera in ("cam00", "cam01"):
         script("add_detector.py", match / f"videos/{camera}.mp4", poses / f"{camera}.npz")

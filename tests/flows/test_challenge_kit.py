@@ -21,8 +21,8 @@ def make_kit(folder, seconds):
 
 @pytest.fixture(scope="module")
 def kit(tmp_path_factory):
-    """A kit of three frames; read only."""
-    return make_kit(tmp_path_factory.mktemp("challenge"), 0.12)
+    """A kit of five frames; read only."""
+    return make_kit(tmp_path_factory.mktemp("challenge"), 0.2)
 
 
 @pytest.mark.slow  # unit/formats has the files, test_release_formats what is written
@@ -62,8 +62,8 @@ def test_the_kit_becomes_a_scored_submission_with_the_given_rows(server, tmp_pat
         ),
         (lambda kit: (kit / "pitch_points.txt").unlink(), ("pitch_points.txt",)),
         (lambda kit: shutil.rmtree(kit / "videos"), (f"videos/{NAME}.mp4", "neither")),
-        (lambda kit: cut(kit, "boxes"), ("skel_2d", "(2, 5)", "(3, 5")),
-        (lambda kit: cut(kit, "skel_3d"), ("skel_3d", "(3, 5)", "(2, 5")),
+        (lambda kit: cut(kit, "boxes"), ("skel_2d", "(4, 5)", "(5, 5")),
+        (lambda kit: cut(kit, "skel_3d"), ("skel_3d", "(5, 5)", "(4, 5")),
         (lambda kit: change_camera(kit, "K", (2, 0, 1), 3.0), ("K[2]", "without skew")),
         (lambda kit: change_camera(kit, "R", (0, 0, 0), np.nan), ("R[0]", "first frame")),
         (lambda kit: change_camera(kit, "k", (2, 4), 0.1), ("k[2]", "three zeros")),
