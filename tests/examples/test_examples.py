@@ -125,11 +125,6 @@ def test_a_stage_of_ones_own_is_computed_once_and_is_right(script, project_copy,
     assert abs(fastest - steps.max()) < 0.06
 
 
-def test_every_example_is_short():
-    for file in EXAMPLES.glob("*.py"):
-        assert len(file.read_text().splitlines()) <= 80, file.name
-
-
 def test_the_library_lists_what_it_has():
     for name in worldpose.__all__:
         assert getattr(worldpose, name) is not None
@@ -187,17 +182,15 @@ def test_an_export_of_ones_own_holds_the_ways_of_all_people(
 def test_a_detector_of_ones_own_gives_poses_that_an_import_takes(script, tmp_path):
     match, poses = tmp_path / "match", tmp_path / "poses"
     scenario = ("--scenario", "tiny", "--seed", 2, "--duration", 0.2, "--cameras", 2)
-    succeed("simulate", *scenario, "--render", "--out", match)
+    succeed("simulate", *scenario, "--render", "--no-stills", "--out", match)
     for camera in ("cam00", "cam01"):
         script("add_detector.py", match / f"videos/{camera}.mp4", poses / f"{camera}.npz")
-    truth = np.load(match / "reference/boxes/cam00.npz")["boxes"][0]
+    truth = np.load(match / "reference/boxes/cam00.npz")["boxes"][0][:, None]
     found = np.load(poses / "cam00.npz")["boxes"][0]
-    inside = np.minimum(truth[:, None, 2:], found[:, 2:]) - np.maximum(
-        truth[:, None, :2], found[:, :2]
-    )
+    inside = np.minimum(truth[..., 2:], found[:, 2:]) - np.maximum(truth[..., :2], found[:, :2])
     common = np.clip(inside, 0.0, None).prod(axis=-1)
-    areas = [np.prod(each[:, 2:] - each[:, :2], axis=-1) for each in (truth, found)]
-    overlap = np.nan_to_num(common / (areas[0][:, None] + areas[1] - common))
+    areas = [np.prod(each[..., 2:] - each[..., :2], axis=-1) for each in (truth, found)]
+    overlap = np.nan_to_num(common / (areas[0] + areas[1] - common))
     assert (overlap.max(axis=1) > 0.5).sum() >= 3  # of five: green and white kits look like pitch
     given = ("--calibration", match / "reference/calibration.toml", "--detections", poses)
     succeed("import", *given, "--fps", 25, "--out", tmp_path / "imported")

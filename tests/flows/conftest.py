@@ -45,3 +45,26 @@ def bob(app):
     import page_client
 
     return page_client.log_in(app, "Bob")
+
+
+@pytest.fixture(scope="module")
+def footage(tmp_path_factory):
+    """A small video."""
+    import numpy as np  # late, as the web framework
+    from test_page_drafts import FPS, FRAMES, SIZE
+
+    from worldpose.video.files import write_video
+
+    file = tmp_path_factory.mktemp("footage") / "near left.mp4"
+    images = (np.full((SIZE[1], SIZE[0], 3), 5 * n, dtype=np.uint8) for n in range(FRAMES))
+    write_video(file, images, FPS, quality=30)
+    return file
+
+
+@pytest.fixture
+def place(tmp_path):
+    """A project, its inbox, and a folder of videos that the operator named."""
+    Store.create(str(tmp_path / "project"))
+    for name in ("inbox", "videos"):
+        (tmp_path / name).mkdir()
+    return tmp_path

@@ -113,16 +113,6 @@ def test_a_bad_file_is_named_and_nothing_is_written(filmed, name, content):
     assert {path.name for path in (filmed / "match").iterdir()} == {"detections", "match.yaml"}
 
 
-def test_boxes_of_no_camera_and_wrong_ones_are_refused(filmed):
-    (filmed / "boxes").mkdir()
-    (filmed / "boxes/a.txt").write_bytes(b"0,1,5,5,5,5,1\n")
-    given = ("--videos", filmed / "videos", "--boxes", filmed / "boxes", "--out", filmed / "out")
-    assert "line 1: frame" in refuse(*given)
-    assert not (filmed / "out").exists()
-    (filmed / "boxes/a.txt").rename(filmed / "boxes/c.txt")
-    assert "found c.txt" in refuse(*given)
-
-
 def test_boxes_have_an_ending_in_any_case(filmed):
     (filmed / "boxes").mkdir()
     (filmed / "boxes/a.TXT").write_bytes(b"1,1,5,5,5,5,1\n")
@@ -215,10 +205,3 @@ def test_a_file_of_another_tool_replaces_none(tiny, tmp_path, names, expected):
     with pytest.raises(InputError, match=expected):
         take_given(Store.open_or_new(tmp_path / "store"), given, folder, {})
     assert {file: file.read_bytes() for file in folder.glob("*.toml")} == before
-
-
-def test_a_lens_whose_stated_size_contradicts_its_middle_is_doubted(lab):
-    lens = {"K": [[500, 0, 639], [0, 500, 479], [0, 0, 1]], "dist": [0] * 4, "size": [640, 480]}
-    (lab / "lens.json").write_text(json.dumps(lens))
-    result = run(*LENS.format("lens.json").replace("LAB", str(lab)).split())
-    assert "principal point of a is 639.0, 479.0, the middle of about 1279 x 959" in result.output

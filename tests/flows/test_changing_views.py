@@ -7,7 +7,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import xarray as xr
-from test_release_formats import FRAMES, bodies, match_folder, origin, tracked, write
+from test_release_formats import (
+    FRAMES,
+    bodies,
+    broadcast,
+    match_folder,
+    origin,
+    restated,
+    tracked,
+    write,
+)
 
 from flows.reports import clips
 from flows.reports.clip_video import people_at_images
@@ -62,26 +71,22 @@ def test_images_that_a_run_leaves_out_are_no_labels_of_an_empty_pitch(
         caplog.clear()
 
 
-def test_files_of_cameras_state_that_a_view_changes(match_folder, tmp_path):
-    run = origin(match_folder, **static_rig({"frame": 102, "shift_px": (30.0, 0.0)}))
-    written = {path.name: path for path in write("worldpose", run, tmp_path)}
-    assert json.loads(written["A_1.json"].read_text())[0]["frame"] == 102
-    (scene,) = write("gltf", run, tmp_path)
-    assert b"camera north moves at frame 102, by 30 px" in scene.read_bytes()
-
-
 def test_changes_of_cameras_are_those_of_the_last_run_and_of_each_match(match_folder, tmp_path):
-    out, run = tmp_path / "out", origin(match_folder, **static_rig({"frame": 102}))
+    change = {"frame": 102, "shift_px": (30.0, 0.0)}
+    out, run = tmp_path / "out", origin(match_folder, **static_rig(change))
     told = out / "camera_changes" / "A_1.json"
-    export(run, ["worldpose"], out)
+    export(run, ["worldpose", "gltf"], out)
+    scene = (out / "scenes" / "A_1.glb").read_bytes()
+    assert b"camera north moves at frame 102, by 30 px" in scene
     before = told.read_bytes()
+    assert json.loads(before)[0]["frame"] == 102
     theirs = {name.replace("A_1", "B_1"): data for name, data in static_rig().items()}
     other = origin(match_folder, **theirs)
     clip = run.spec.clips[0].model_copy(update={"id": "B_1"})
     other.registration.spec = run.spec.model_copy(update={"match_id": "other", "clips": (clip,)})
     export(other, ["worldpose"], out)
     assert json.loads((told.parent / "B_1.json").read_text()) == []
-    assert told.read_bytes() == before != b"[]"
+    assert told.read_bytes() == before
     export(origin(match_folder, **static_rig()), ["worldpose"], out)
     assert json.loads(told.read_text()) == []
 
@@ -168,19 +173,24 @@ def test_labels_of_a_stage_have_its_own_flags(match_folder, tmp_path, monkeypatc
         assert {v for each in labels for v in each["keypoints"][2::3] if v} == {flag}, stage
 
 
-def test_labels_of_a_drifting_static_camera_are_at_its_images(match_folder, tmp_path):
+# Images of the broadcast camera are 0.4 of a frame late; image 100 of the static one is a quarter
+# of a frame before match frame 100.
+@pytest.mark.parametrize(("camera", "late"), [("main", 0.4), ("north", -0.25)])
+def test_labels_are_where_people_are_at_the_moments_of_the_images(
+    match_folder, tmp_path, camera, late
+):
     moving = bodies()
     moving["transl"][:, :, 0] += 0.1 * np.arange(4)[:, None]
-    results = static_rig()
-    results["body_fitting__A_1"] = moving
-    run = origin(match_folder, **results)
-    places = {}
-    for offset in (0.0, [[0, 0.25]]):
-        north = run.spec.cameras[0].model_copy(update={"offset_frames": offset})
-        spec = run.spec.model_copy(update={"cameras": (north, *run.spec.cameras[1:])})
-        shifted = replace(run, registration=SimpleNamespace(spec=spec))
-        (results,) = write("alphapose", shifted, tmp_path / str(bool(offset)))
-        entries = json.loads(results.read_text())
-        places[bool(offset)] = np.array([e["keypoints"][::3] for e in entries if e["idx"] == 3])
-    # Image 100 is a quarter of a frame before match frame 100: 0.025 m, at 4000 px and 70 m.
-    np.testing.assert_allclose(places[True] - places[False], -0.025 * 4000 / 70, rtol=0.02)
+    known = {"broadcast_calibration__A_1": broadcast()} if camera == "main" else static_rig()
+    run, places = origin(match_folder, **{**known, "body_fitting__A_1": moving}), []
+    for offset in (0.0, late):
+        clip = run.spec.clips[0].model_copy(update={"broadcast_offset_frames": 1.0 - offset})
+        north = run.spec.cameras[0].model_copy(update={"offset_frames": [[0, -offset]]})
+        shifted = restated(run, clips=(clip,), cameras=(north, *run.spec.cameras[1:]))
+        (results,) = write("alphapose", shifted, tmp_path / str(offset))
+        entries = [each for each in json.loads(results.read_text()) if each["idx"] == 3]
+        if camera == "main":
+            assert [each["image_id"] for each in entries] == [f"{n}.jpg" for n in (1, 2, 3)]
+        places.append(np.array([each["keypoints"][::3] for each in entries]))
+    # A step of 0.1 m per frame, at 4000 px and 70 m.
+    np.testing.assert_allclose(places[1] - places[0], late * 0.1 * 4000 / 70, rtol=0.02)

@@ -10,10 +10,9 @@ import page_client
 import pytest
 import yaml
 from command_line import invoke, succeed
+from run_records import calibration, match_spec
 
 from data_contracts.cameras import LensCalibration
-from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
-from flows.cli import console
 from flows.cli.locate import _lens, _print_offsets
 from flows.results.clock_offsets import ClockOffsets, Proposal, propose
 from flows.run_record import latest_run
@@ -31,8 +30,10 @@ from worldpose.video.files import write_video
 
 @pytest.fixture(scope="module")
 def shifted(tiny, tmp_path_factory):
-    """The match `tiny` with a wrong clock offset of one camera."""
-    return shift(tiny, tmp_path_factory.mktemp("shifted") / "tiny")
+    """The match `tiny` with given cameras, of which one has a wrong clock offset."""
+    folder = shift(tiny, tmp_path_factory.mktemp("shifted") / "tiny")
+    shutil.copy(folder / "reference" / "calibration.toml", folder)
+    return folder
 
 
 def shift(tiny, folder):
@@ -45,36 +46,17 @@ def shift(tiny, folder):
 
 
 def test_an_offset_is_found_drawn_and_written(server, shifted, tmp_path):
-    options = ("--project", tmp_path / "p", "--json")
-    plot = tmp_path / "clocks.svg"
-    found = succeed("synchronize", shifted, "--plot", plot, *options).json
+    asked, plot = ("synchronize", shifted, "--project", tmp_path / "p"), tmp_path / "clocks.svg"
+    found = succeed(*asked, "--plot", plot, "--json").json
     rows = {row["camera"]: row for row in found["cameras"]}
     assert {name: row["proposed"] for name, row in rows.items()} == dict.fromkeys(rows, 0)
     assert rows["cam02"]["stated"] == 5
     assert abs(rows["cam02"]["found"]) < 0.2
     assert found["applied"] == {}
     assert "<svg" in plot.read_text()
-    applied = succeed("synchronize", shifted, "--apply", *options).json["applied"]
-    assert applied == {"cam02": 0}
+    assert succeed(*asked, "--apply", "--json").json["applied"] == {"cam02": 0}
     cameras = yaml.safe_load((shifted / "match.yaml").read_text())["cameras"]
     assert [camera.get("offset_frames", 0) for camera in cameras] == [0] * len(cameras)
-    again = succeed("synchronize", shifted, *options[:2]).out
-    first, *others = rows
-    assert f"The people confirm the offsets of {', '.join(others)}, relative to {first}.\n" in again
-    assert "--apply" not in again
-
-
-def test_the_table_of_offsets_names_the_reference_and_the_unit(monkeypatch):
-    rows = [Proposal(name, 4, 4.0, 0.5, 4, "", "left") for name in ("left", "right")]
-    printed = []
-    monkeypatch.setattr(console, "print_table", lambda *table: printed.extend(table))
-    _print_offsets(ClockOffsets("clip", ["left", "right"], None, rows), None, applied=False)
-    title, _, shown = printed
-    assert "in frames of each camera" in title
-    assert shown == [
-        ("left", "4", "-", "-", "4", "the reference: its offset stays"),
-        ("right", "4", "4.00", "0.50", "4", "relative to left"),
-    ]
 
 
 def test_an_offset_that_nothing_tells_is_not_called_right(capsys):
@@ -95,7 +77,7 @@ def test_the_page_shows_the_same_proposal_and_applies_it_in_the_next_version(
     project, inbox = tmp_path / "p", tmp_path / "p" / "inbox"
     folder = shift(tiny, tmp_path / "m")
     succeed("run", folder, "--until", "detection", "--project", project)
-    before = (folder / "match.yaml").read_bytes()
+    store, before = Store.open(str(project)), (folder / "match.yaml").read_bytes()
     inbox.mkdir()
     ada = page_client.log_in(page_client.served(project), "Ada")
     offsets = f"{page_client.MATCH}/offsets"
@@ -105,7 +87,7 @@ def test_the_page_shows_the_same_proposal_and_applies_it_in_the_next_version(
     assert (row["stated"], row["proposed"]) == (5, 0) and abs(row["found"]) < 0.2
     assert ada.get(f"{offsets}/plot").content.startswith(b"\x89PNG")
     with monkeypatch.context() as patch:  # a unit that failed changed nothing
-        record = latest_run(Store.open(str(project)), page_client.TINY)
+        record = latest_run(store, page_client.TINY)
         rest = {unit: key for unit, key in record.results.items() if unit != "detection/cam05"}
         part = record.model_copy(update={"results": rest})
         patch.setattr("flows.web.offsets.latest_run", lambda *_: part)
@@ -114,31 +96,17 @@ def test_the_page_shows_the_same_proposal_and_applies_it_in_the_next_version(
     assert ada.post(offsets, json={"offsets": found["changed"]}).status_code == 200
     (coming,) = ada.get(page_client.MATCH).json()["next_versions"]
     assert coming["state"] == "arriving"
-    store = Store.open(str(project))
     state = served_state(store.url)
     watch_once(state, inbox, 0.0)
     (arrival,) = take_in(store, state, inbox, 0.0, run_key)
     # The same videos are no reason to take an earlier run for that of this version.
-    assert arrival.flow_run != f"arrival-{store.registration(page_client.TINY).identity}"
-    spec = store.registration(page_client.TINY).spec
-    assert [each.offset_frames for each in spec.cameras if each.kind == "static"] == [0] * 6
+    registration = store.registration(page_client.TINY)
+    assert arrival.flow_run != f"arrival-{registration.identity}"
+    static = [each for each in registration.spec.cameras if each.kind == "static"]
+    assert [each.offset_frames for each in static] == [0] * 6
     assert (folder / "match.yaml").read_bytes() == before
     answer = ada.get(offsets)  # nobody corrects twice by the run of the old offsets
     assert answer.status_code == 422 and "Run it again first" in answer.json()["error"]
-
-
-@pytest.mark.parametrize(
-    ("options", "told"),
-    [
-        (("--clip", "second"), "--clip second: expected one of clip, found 'second'"),
-        (("--plot", "clocks.doc"), "clocks.doc: expected a file name that ends with .svg, .pdf"),
-    ],
-)
-def test_wrong_options_are_told_before_anything_is_computed(shifted, tmp_path, options, told):
-    Store.create(tmp_path / "p")
-    result = invoke("synchronize", shifted, "--project", tmp_path / "p", *options)
-    assert isinstance(result.exception, UsageError)
-    assert told in str(result.exception)
 
 
 @pytest.mark.parametrize(
@@ -157,26 +125,20 @@ def test_wrong_options_are_told_before_anything_is_computed(shifted, tmp_path, o
 def test_offsets_are_in_the_cameras_own_frames_for_the_whole_match(
     camera, first_frame, late, proposed
 ):
-    cameras = (
-        CameraSpec(id="a", width=9, height=9),
-        CameraSpec(id="b", width=9, height=9, **camera),
-    )
-    clip = ClipSpec(id="clip", first_frame=first_frame, frame_count=30000)
-    spec = MatchSpec(match_id="m", fps=50.0, cameras=cameras, clips=(clip,))
+    clips = {"clip": {"first_frame": first_frame, "frame_count": 30000}}
+    spec = match_spec({"a": {}, "b": camera}, clips, fps=50.0)
     std, empty = np.full(2, 0.05), np.empty(0)
     found = Synchronization(np.array([0.0, late]), std, ("", ""), empty, empty, ((0, 1),))
-    row = propose(spec, clip, ["a", "b"], [[(0, 0.0)], [(0, late)]], 1, found)
+    row = propose(spec, spec.clips[0], ["a", "b"], [[(0, 0.0)], [(0, late)]], 1, found)
     np.testing.assert_allclose(row.proposed, proposed, atol=0.02)
 
 
 def test_a_first_camera_that_drifts_changes_no_other_offset():
-    cameras = tuple(CameraSpec(id=name, width=9, height=9) for name in "abc")
-    clip = ClipSpec(id="clip", frame_count=1001)
-    spec = MatchSpec(match_id="m", fps=50.0, cameras=cameras, clips=(clip,))
+    spec = match_spec("abc", {"clip": {"frame_count": 1001}}, fps=50.0)
     std, empty = np.full(3, 0.05), np.empty(0)
     found = Synchronization(np.zeros(3), std, ("", "", ""), empty, empty, ((0, 1, 2),))
     courses = [[(0, 0.0), (1000, 8.0)], [(0, 0.0)], [(0, 3.0)]]
-    rows = [propose(spec, clip, list("abc"), courses, c, found) for c in range(3)]
+    rows = [propose(spec, spec.clips[0], list("abc"), courses, c, found) for c in range(3)]
     assert [row.proposed for row in rows] == [((0, 0.0), (1000, -8.0)), 0, -3]
     assert {row.relative_to for row in rows} == {"b"}
 
@@ -216,34 +178,27 @@ def boards(tmp_path_factory):
     return folder
 
 
-def calibrate(*arguments):
-    return invoke("calibrate", *arguments)
-
-
 def test_images_and_a_video_become_lenses(boards, tmp_path):
     out, plot = tmp_path / "lenses.toml", tmp_path / "lens.svg"
-    result = calibrate(boards, *OPTIONS, "--out", out, "--plot", plot, "--json")
+    result = invoke("calibrate", boards, *OPTIONS, "--out", out, "--plot", plot, "--json")
     assert result.exit_code == 0, result.exception
     told = json.loads(result.stdout)["cameras"]
     assert told["a"]["left_out"] == {"8": "no whole board found"}
     assert told["a"]["images"] == 8
     assert told["b"]["images"] >= 7
-    lenses = read_lens_toml(out, {"a": SIZE, "b": SIZE})
-    for lens in lenses.values():
+    for lens in read_lens_toml(out, {"a": SIZE, "b": SIZE}).values():
         assert lens.focal_px == pytest.approx(FOCAL, abs=max(3.0, 4.0 * lens.focal_std_px))
     assert "<svg" in plot.read_text()
-    refused = calibrate(boards, *OPTIONS, "--out", out)
+    refused = invoke("calibrate", boards, *OPTIONS, "--out", out, "--camera", "a")
     assert "a new file" in str(refused.exception), "people edit lenses"
-    other = tmp_path / "a.toml"
-    shown = calibrate(boards, *OPTIONS, "--out", other, "--camera", "a").stdout
-    assert "a: 9.png is left out: no whole board found" in shown
 
 
 def test_squares_in_place_of_corners_are_told(boards, tmp_path):
     out = tmp_path / "lenses.toml"
     options = ("--columns", "8", "--rows", "5", "--square", "0.06", "--camera", "a")
-    result = calibrate(boards, *options, "--out", out)
+    result = invoke("calibrate", boards, *options, "--out", out)
     assert "a: the board has 7 x 4 inner corners; 8 x 5 is its number of squares" in result.stderr
+    assert "a: 9.png is left out: no whole board found" in result.stdout
     lens = read_lens_toml(out, {"a": SIZE})["a"]
     assert lens.focal_px == pytest.approx(FOCAL, abs=max(3.0, 4.0 * lens.focal_std_px))
 
@@ -259,20 +214,20 @@ def test_squares_in_place_of_corners_are_told(boards, tmp_path):
     ],
 )
 def test_what_is_wrong_is_told(boards, tmp_path, place, options, kind, told):
-    result = calibrate(boards / place, *OPTIONS, *options, "--out", tmp_path / "lenses.toml")
+    out = tmp_path / "lenses.toml"
+    result = invoke("calibrate", boards / place, *OPTIONS, *options, "--out", out)
     assert isinstance(result.exception, kind), result.exception
     assert told in str(result.exception)
-    assert not (tmp_path / "lenses.toml").exists()
+    assert not out.exists()
 
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory):
     """A match without a pitch and calibration, with lenses; and the true cameras."""
     folder = tmp_path_factory.mktemp("lab") / "lab"
-    options = ("--seed", "1", "--duration", "6", "--cameras", "4", "--calibrated")
-    succeed(
-        "simulate", "--scenario", "tiny", "--out", folder, *options, "--no-stills", "--no-video"
-    )
+    options = ("--seed", 1, "--duration", 6, "--cameras", 4, "--calibrated")
+    options += ("--no-stills", "--no-video")
+    succeed("simulate", "--scenario", "tiny", "--out", folder, *options)
     file = folder / "match.yaml"
     content = yaml.safe_load(file.read_text()) | {"match_id": "lab", "pitch": "none"}
     content["cameras"] = [each for each in content["cameras"] if each["kind"] == "static"]
@@ -286,22 +241,17 @@ def lab(tmp_path_factory):
         if place.stem not in known:
             place.unlink()
     for name in ("annotations", "reference", "estimates", "broadcast"):
-        for place in (folder / name).rglob("*") if (folder / name).is_dir() else ():
-            if place.is_file():
-                place.unlink()
+        shutil.rmtree(folder / name, ignore_errors=True)
     truth = read_calibration(folder / "calibration.toml")
     (folder / "calibration.toml").unlink()
     (folder / "pitch.json").unlink()
+    stds = {"focal_std_px": 3.0, "principal_point_std_px": 3.0, "distortion_std": 0.005}
+    kept = ("id", "image_size", "principal_point_px", "distortion")
     lenses = {
         name: LensCalibration(
-            id=name,
-            image_size=one.image_size,
+            **{key: getattr(one, key) for key in kept},
             focal_px=float(np.mean(one.focal_px)),
-            principal_point_px=one.principal_point_px,
-            distortion=one.distortion,
-            focal_std_px=3.0,
-            principal_point_std_px=3.0,
-            distortion_std=0.005,
+            **stds,
         )
         for name, one in truth.items()
     }
@@ -334,14 +284,9 @@ def test_cameras_are_found_and_written_in_place_of_lenses(server, lab, tmp_path)
 
 
 def test_unequal_focal_lengths_widen_the_lens_or_are_refused(tmp_path):
-    def lens(fx, fy):
-        given = SimpleNamespace(
-            image_size=(1440, 1080),
-            focal_px=(fx, fy),
-            principal_point_px=(719.5, 539.5),
-            distortion=(0.0,) * 5,
-            lens_model="brown",
-        )
+    def lens(*focal):
+        size = {"image_size": (1440, 1080), "principal_point_px": (719.5, 539.5)}
+        given = calibration("a", **size, focal_px=focal)
         folder = SimpleNamespace(folder=tmp_path, lenses={}, calibrations={"a": given})
         return _lens(SimpleNamespace(folder=folder), "a")
 
@@ -353,16 +298,29 @@ def test_unequal_focal_lengths_widen_the_lens_or_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        ((), "--stature: expected either --stature or --distance"),
-        (("--stature", "1.8", "--distance", "cam00", "cam01", "3"), "found both"),
-        (("--distance", "cam00", "cam09", "3"), "--distance cam00 cam09 3: expected two of the"),
-        (("--stature", "1.8", "--clip", "b"), "--clip b: expected one of"),
+        ("--clip second", "--clip second: expected one of clip, found 'second'"),
+        ("--plot clocks.doc", "clocks.doc: expected a file name that ends with .svg, .pdf"),
+    ],
+)
+def test_wrong_options_are_told_before_anything_is_computed(shifted, tmp_path, options, told):
+    Store.create(tmp_path / "p")
+    result = invoke("synchronize", shifted, "--project", tmp_path / "p", *options.split())
+    assert isinstance(result.exception, UsageError)
+    assert told in str(result.exception)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ("", "--stature: expected either --stature or --distance"),
+        ("--stature 1.8 --distance cam00 cam01 3", "found both"),
+        ("--distance cam00 cam09 3", "--distance cam00 cam09 3: expected two of the"),
+        ("--stature 1.8 --clip b", "--clip b: expected one of"),
     ],
 )
 def test_wrong_options_of_locating_are_told_before_anything_is_computed(
     lab, tmp_path, options, told
 ):
-    folder, _ = lab
-    result = invoke("locate-cameras", folder, "--project", tmp_path / "p", *options)
+    result = invoke("locate-cameras", lab[0], "--project", tmp_path / "p", *options.split())
     assert isinstance(result.exception, UsageError)
     assert told in str(result.exception)

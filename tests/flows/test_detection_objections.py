@@ -28,22 +28,13 @@ WHY |= {3: None, 4: None}
 def stored(edits=()):
     """Detections of every person in every frame, with corrections."""
     many = (FRAMES, PEOPLE)
-    arrays = {
-        "keypoints": np.zeros((*many, 17, 2), np.float32),
-        "confidence": np.ones((*many, 17), np.float32),
-        "boxes": np.zeros((*many, 4), np.float32),
-        "score": np.ones(many, np.float32),
-    }
+    shapes = {"keypoints": (17, 2), "confidence": (17,), "boxes": (4,), "score": ()}
+    arrays = {name: np.ones((*many, *shape), np.float32) for name, shape in shapes.items()}
     found = KeypointDetections.from_arrays({**arrays, "frame": np.arange(FRAMES)})
     after = replay_detections(found, edits).observations
     dims = {"keypoints": ("joint", "xy"), "confidence": ("joint",), "boxes": ("side",)}
-    return xr.Dataset(
-        {
-            name: (("frame", "person", *dims.get(name, ())), each)
-            for name, each in after.arrays().items()
-        },
-        {"frame": after.frame},
-    )
+    kept = {n: (("frame", "person", *dims.get(n, ())), a) for n, a in after.arrays().items()}
+    return xr.Dataset(kept, {"frame": after.frame})
 
 
 class Recipe(SimpleNamespace):
@@ -77,7 +68,7 @@ def opened(monkeypatch):
 
 
 @pytest.mark.parametrize("stage", ["ingest", "detection"])
-@pytest.mark.parametrize("count", range(len(SAID) + 1))
+@pytest.mark.parametrize("count", [0, 2, 4, 5])
 def test_corrections_that_the_latest_run_lacks_are_replayed_alone(stage, count, opened):
     can = [n for n, edit in enumerate(SAID) if stage == "ingest" or edit.frame < FRAMES]
     store, *_ = opened(f"{stage}/c", [SAID[n] for n in can[:count]])

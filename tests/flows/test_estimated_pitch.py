@@ -94,36 +94,3 @@ def test_a_survey_becomes_pitch_json(survey, tmp_path):
     again = worldpose("import", "--pitch", survey, "--out", match)
     assert again.code == 2
     assert "expected no pitch there yet" in again.err
-
-
-def test_a_survey_in_feet_is_refused_and_nothing_is_written(survey, tmp_path):
-    header, *rows = survey.read_text().splitlines()
-    places = np.array([[float(cell) for cell in row.split(",")[1:]] for row in rows]) / 0.3048
-    feet = [",".join([name, *map(str, place)]) for name, place in zip(NAMES, places, strict=True)]
-    survey.write_text("\n".join([header, *feet]) + "\n")
-    answer = worldpose("import", "--pitch", survey, "--out", tmp_path / "match")
-    assert answer.code == 1
-    assert "as feet are" in answer.err
-    assert "Traceback" not in answer.err
-    assert not (tmp_path / "match").exists()
-
-
-def test_clicks_of_an_annotation_tool_go_into_a_match_by_the_command(tmp_path):
-    folder = tmp_path / "m"
-    folder.mkdir()
-    (folder / "match.yaml").write_text(
-        "contract: 1\nmatch_id: m\nfps: 25\ncameras:\n"
-        "  - {id: east, width: 1920, height: 1080}\n"
-        "clips:\n  - {id: c, first_frame: 0, frame_count: 50}\n"
-    )
-    file = tmp_path / "clicks.xml"
-    file.write_text(
-        '<annotations><image name="a.png" width="1920" height="1080">'
-        '<points label="halfway_far" points="10.5,20.5;30.5,40.5"/></image></annotations>'
-    )
-    command = ["import", "--clicks", str(file), "--out", str(folder)]
-    assert "one image per static camera" in worldpose(*command).err
-    done = succeed(*command, "--camera", "east")
-    assert "'halfway_far' is clicked at (10, 20) and at (30, 40). Which one is meant?" in done.err
-    assert (folder / "annotations" / "static_calibration" / "east.json").is_file()
-    assert worldpose(*command, "--fps", "25").code == 2

@@ -11,14 +11,12 @@ from flows.review.edit_conflicts import StaleEditError
 from flows.review.verdicts import withdraw
 from worldpose.errors import UsageError
 from worldpose.formats.annotations import FORMATS, read_annotations, write_annotations
-from worldpose.store.store import Store
 
 PLACES = [("cam00", 3), ("cam01", 4)]
 
 
-@pytest.mark.parametrize("form", FORMATS)
-def test_what_people_annotate_elsewhere_is_corrected_here_once(project_copy, tmp_path, form):
-    store = Store.open(str(project_copy))
+def test_what_people_annotate_elsewhere_is_corrected_here_once(store, tmp_path):
+    form = FORMATS[0]  # test_formats has all
     match = open_match(store, TINY)
     out = tmp_path / "out"
     written = export_people(store, match, PLACES, out, form)

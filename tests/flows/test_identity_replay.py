@@ -1,12 +1,10 @@
 """Corrections of identities over stored tracks, with and without those before the corrections."""
 
 from dataclasses import replace
-from datetime import UTC, datetime
 from importlib import import_module
 from types import SimpleNamespace
 
 import numpy as np
-import page_client
 import pytest
 import xarray as xr
 from command_line import TINY, succeed
@@ -14,14 +12,7 @@ from page_client import MATCH
 from run_records import correction
 
 from data_contracts.match import PlayerSpec
-from data_contracts.review import (
-    Correction,
-    DeletedDetection,
-    MergedTracks,
-    MovedPoint,
-    NamedTrack,
-    SplitTrack,
-)
+from data_contracts.review import DeletedDetection, MergedTracks, MovedPoint, NamedTrack, SplitTrack
 from flows.registering import open_match
 from flows.results.best_results import clip_positions
 from flows.review import corrections, identities
@@ -156,10 +147,7 @@ def test_what_the_latest_tracks_lack_alone_is_replayed_up_to_a_limit(said, made,
 
 
 def test_objections_are_replayed_once_for_results_and_corrections(monkeypatch):
-    class Kept:
-        """A store."""
-
-    store, asked = Kept(), []
+    store, asked = type("Store", (), {})(), []
 
     def replay(store, match, clip):
         asked.append(clip)
@@ -179,32 +167,6 @@ def test_objections_are_replayed_once_for_results_and_corrections(monkeypatch):
         assert found == {"x": "refused", "m": "no person 9"}
     assert asked.count("clip") == 2
     assert corrections.objections_now(store, match, None) == {}
-
-
-def test_corrections_are_replayed_once_until_another_one_or_another_result(monkeypatch):
-    class Run(dict):
-        """A run, and its store."""
-
-        record = SimpleNamespace(match_id="m", run_id="0001", results={})
-        __hash__ = object.__hash__
-        run = runs = lambda self, _: self.record
-        registration = lambda self, _: None  # noqa: E731
-        has = lambda self, *_: True  # noqa: E731
-        manifest = lambda self, *_: SimpleNamespace(recipe=SimpleNamespace(sources={}))  # noqa: E731
-
-    run, real, made = Run({"tracking/clip": None}), identities._replay, []
-    run.store = run
-    monkeypatch.setattr(identities, "_replay", lambda *a, **k: made.append(a) or real(*a, **k))
-    monkeypatch.setattr(identities, "open_stored", lambda *_: StoredResult(tracks(), "k", []))
-    first, later = {"a": named(0, "Al"), "b": named(7, "Bo")}, {"c": named(1, "Cy")}
-    for count, key, said in ((2, "k", first), (4, "k", first | later), (6, "l", first | later)):
-        run.record.results["tracking/clip"] = key
-        monkeypatch.setattr(identities, "read_journal", lambda *_, said=said: journal(said))
-        match = SimpleNamespace(match_id="m", corrections=journal(said).standing.values())
-        for _ in range(3):
-            assert [*identities.lost_names(run)] == ["b"]
-            now = identities.identities_now(run, match, "clip", with_joints=False).identities
-        assert (len(made), len(now.names)) == (count, 1 + ("c" in said))
 
 
 def journal(said, withdrawn=()):
@@ -253,22 +215,19 @@ def compute(store, unit):
 
 
 def test_a_split_and_a_merge_are_in_the_tracks_and_replayed_to_the_same_bytes(store):
-    before = planned(store)
-    clip = before.recipe.unit
+    before, clip = planned(store), "clip"
     found = identities_now(store, open_match(store, TINY), clip).identities
     middle = int(found.frame[len(found.frame) // 2])
     seen = find_sighting(found, 0)
     say(store, a=SplitTrack(clip=clip, person=0, seen=seen, first_frame_of_new=middle))
     after = planned(store)
-    assert before.published
-    assert not after.published
+    assert before.published and not after.published
     first = compute(store, after)
     data = store.open_result(TINY, "tracking", clip, after.key)
     new = int(found.person.max()) + 1
     assert data["person"].values.tolist() == [*found.person.tolist(), new]
     halves = (data["detection_index"].sel(person=[0, new]) >= 0).any("camera").values
-    assert halves[: len(halves) // 2, 1].sum() == 0
-    assert halves[len(halves) // 2 :, 0].sum() == 0
+    assert not halves[: len(halves) // 2, 1].any() and not halves[len(halves) // 2 :, 0].any()
     assert data.attrs["objections"] == [None]
     # Without the tracker's own result it tracks again, and gives the same bytes.
     for key in (before.key, after.key):
@@ -277,17 +236,14 @@ def test_a_split_and_a_merge_are_in_the_tracks_and_replayed_to_the_same_bytes(st
     assert (again.content, again.figures) == (first.content, first.figures)
     compute(store, before)
     # Merged again, all identities are the former ones.
-    merge = MergedTracks(clip=clip, kept=0, merged=new)
-    say(store, b=merge)
+    say(store, b=MergedTracks(clip=clip, kept=0, merged=new))
     compute(store, planned(store))
     whole = store.open_result(TINY, "tracking", clip, planned(store).key)
     assert (whole["detection_index"].values == found.detection_index).all()
-    corrections = open_match(store, TINY).journal.standing.values()
-    assert [type(each) for each in corrections] == [Correction, Correction]
 
 
 def test_an_edit_of_somebody_who_is_another_by_now_is_refused(store):
-    clip = planned(store).recipe.unit
+    clip = "clip"
     found = identities_now(store, open_match(store, TINY), clip).identities
     middle = int(found.frame[len(found.frame) // 2])
     seen = find_sighting(found, 0, first=middle)
@@ -301,8 +257,7 @@ def test_an_edit_of_somebody_who_is_another_by_now_is_refused(store):
     compute(store, unit)
     results = {**before.results, f"tracking/{clip}": unit.key}
     after = before.model_copy(update={"results": results})
-    runs = ((before, "automatic"), (after, "corrected"))
-    for latest, origin in runs:
+    for latest, origin in ((before, "automatic"), (after, "corrected")):
         assert origins_of(store, open_match(store, TINY), latest)[f"tracking/{clip}"] == origin
 
 
@@ -338,7 +293,7 @@ def test_a_name_recomputes_nothing_and_is_in_the_tables_at_once(store):
     assert names_of(after, clip) == {1: names[1], new: "late"}
 
 
-def test_a_name_whose_detection_is_gone_is_reported_until_it_is_given_again(store, project_copy):
+def test_a_name_whose_detection_is_gone_is_reported_until_it_is_given_again(store, ada):
     found = identities_now(store, open_match(store, TINY), "clip").identities
     one, other = found.person.tolist()[:2]
     seen = find_sighting(found, one)
@@ -347,19 +302,17 @@ def test_a_name_whose_detection_is_gone_is_reported_until_it_is_given_again(stor
     assert lost_names(run) == {}
     wrong = find_sighting(found, other)  # as after a run whose tracks have another detection there
     say(store, b=NamedTrack(clip="clip", person=other, seen=wrong, name="Bea"))
-    journal = read_journal(store, TINY)
-    moved = journal.standing["b"].edit.model_copy(update={"seen": seen})
-    record = journal.standing["b"].model_copy(update={"id": "c", "edit": moved})
+    said = read_journal(store, TINY).standing["b"]
+    moved = {"id": "c", "edit": said.edit.model_copy(update={"seen": seen})}
     withdraw(store, open_match(store, TINY), ["b"], who="Ada", why="")
-    append(store, read_journal(store, TINY), [record])
-    (said,) = lost_names(run).values()
-    assert "'Bea' names no person" in said and names_of(run, "clip") == {one: "Ann"}
-    ada = page_client.log_in(page_client.served(project_copy), "Ada")
+    append(store, read_journal(store, TINY), [said.model_copy(update=moved)])
+    (told,) = lost_names(run).values()
+    assert "'Bea' names no person" in told and names_of(run, "clip") == {one: "Ann"}
     page = ada.get(MATCH).json()
     (group,) = page["groups"]
     assert (page["stale"], group["stale"]) == (1, 1)
     (listed,) = succeed("review", "show", TINY, "--project", store.url, "--json").json["stale"]
-    assert (listed["id"], listed["reason"]) == ("c", said)
+    assert (listed["id"], listed["reason"]) == ("c", told)
     say(store, d=NamedTrack(clip="clip", person=other, seen=wrong, name="Bea"))
     assert lost_names(run) == {}
 
@@ -406,52 +359,50 @@ def test_every_door_refuses_what_does_not_fit_the_results(store):
 
 @pytest.mark.slow
 def test_what_a_run_refused_is_told_so_and_what_no_run_has_yet(store, tmp_path):
-    edits = {
-        "out": DeletedDetection(camera="cam01", frame=5, detection=77),
-        "one": MergedTracks(clip="clip", kept=0, merged=88),
-    }
-    based = {"match_id": TINY, "who": "Ada", "based_on": {}}
-    made = [
-        Correction(id=name, edit=edit, made_at=datetime.now(UTC), **based)
-        for name, edit in edits.items()
-    ]
+    out = DeletedDetection(camera="cam01", frame=5, detection=77)
+    edits = {"out": out, "one": MergedTracks(clip="clip", kept=0, merged=88)}
+    made = [correction(edit, name, match_id=TINY) for name, edit in edits.items()]
     append(store, read_journal(store, TINY), made)  # as an older version kept them
 
-    def compute_units(stage, units):
-        for unit in units:
-            if not unit.published:
-                task = getattr(import_module(stage.task_module), stage.name)
-                task.fn(unit.work(store.url, open_match(store, TINY), "0002"))
-                yield unit, None
+    def run(stages):
+        def compute_units(stage, units):
+            for unit in units:
+                if not unit.published:
+                    task = getattr(import_module(stage.task_module), stage.name)
+                    task.fn(unit.work(store.url, open_match(store, TINY), "0002"))
+                    yield unit, None
 
-    match, until = open_match(store, TINY), selected_stages(None, "tracking")
-    record = RunLog.begin(store, match, until, {}).run_stages(compute_units)
+        return RunLog.begin(store, open_match(store, TINY), stages, {}).run_stages(compute_units)
+
+    def shown(*options):
+        return succeed("review", "show", TINY, "--project", store.url, *options)
+
+    record = run(until := selected_stages(None, "tracking"))
     told = objections_of(Run(store, record))
     # As after a garbage collection.
     plain = ResultId(TINY, "ingest", "cam01", store.run(TINY, "0001").results["ingest/cam01"])
     (store.blobs.root / plain.path).rename(tmp_path / "plain")
-    found = objections_of(Run(store, record))
+    assert objections_of(Run(store, record)) == told
     (tmp_path / "plain").rename(store.blobs.root / plain.path)
-    assert found == told
-    assert "there is no detection 77" in found["out"] and "no person 88" in found["one"]
-    assert not {"corrected"} & {*origins_of(store, open_match(store, TINY), record).values()}
+    assert "there is no detection 77" in told["out"] and "no person 88" in told["one"]
+    assert "corrected" not in origins_of(store, open_match(store, TINY), record).values()
     deleted = DeletedDetection(camera="cam01", frame=5, detection=0)
     say(store, later=deleted)
-    shown = succeed("review", "show", TINY, "--project", store.url).out
-    assert "does not apply: there is no detection 77" in shown
-    assert "not in a run yet" in shown and "corrected" not in shown and "  applied" not in shown
+    text = shown().out
+    assert "does not apply: there is no detection 77" in text
+    assert "not in a run yet" in text and "corrected" not in text and "  applied" not in text
     # Made again, it is in the results of before; a name is in none, and counts at once.
     say(store, name=NamedTrack(clip="clip", person=0, name="Bo"))
     withdraw(store, open_match(store, TINY), ["later", "out", "one"], who="Ada", why="")
     say(store, again=deleted)
-    RunLog.begin(store, open_match(store, TINY), until[:1], {}).run_stages(compute_units)
+    run(until[:1])
     withdraw(store, open_match(store, TINY), ["again"], who="Ada", why="")
     say(store, third=deleted)
-    shown = succeed("review", "show", TINY, "--project", store.url, "--json").json
-    states = {each["id"]: each["state"] for each in shown["corrections"]}
+    found = shown("--json").json
+    states = {each["id"]: each["state"] for each in found["corrections"]}
     assert states == {"third": "applied", "name": "applied"}
-    assert shown["origins"]["ingest/cam01"] == "corrected"
+    assert found["origins"]["ingest/cam01"] == "corrected"
     click = open_match(store, TINY).folder.clicked["cam02"].points[0].name
     say(store, click=MovedPoint(camera="cam02", marking=click, xy=None))
-    shown = succeed("review", "show", TINY, "--project", store.url).out
-    assert shown.count("  applied") == 2 and shown.count("not in a run yet") == 1
+    text = shown().out
+    assert text.count("  applied") == 2 and text.count("not in a run yet") == 1

@@ -1,6 +1,5 @@
 """Runs of imported cameras and 2D poses: mixed rigs, masts, knocked cameras, other lenses."""
 
-import csv
 import json
 from dataclasses import replace
 
@@ -9,16 +8,14 @@ import numpy as np
 import pytest
 import yaml
 from camera_builders import look_at_camera
-from command_line import succeed, worldpose
+from command_line import succeed
 from imported_people import apart_from, circling, import_people, seen_by
 
-from flows.registering import open_match
-from flows.reports.cameras import health_picture
 from worldpose.camera_consistency.health import judge_health
 from worldpose.formats.joints_file import read_joints
 from worldpose.formats.release_cameras import read_camera
 from worldpose.geometry.lens_models import LensModel
-from worldpose.store.store import Store, open_run
+from worldpose.store.store import open_run
 
 FRAMES, FPS, HD = 100, 50.0, (1920, 1080)
 
@@ -64,24 +61,20 @@ def test_cameras_of_a_mixed_rig_are_right_and_their_people_in_their_regions(
             own = own[:, :2] if c < 3 else own[:, 2:]
         pixels[f"cam{c}"] = seen_by(camera, own, rng, max(camera.image_size) / 1920.0)
     named = {f"cam{c}": camera for c, camera in enumerate(cameras)}
-    match, project, out = (
-        import_people(tmp_path, named, pixels, FPS),
-        tmp_path / "p",
-        tmp_path / "o",
-    )
-    file = match / "match.yaml"
+    match, project = import_people(tmp_path, named, pixels, FPS), tmp_path / "project"
     for c, rate in rates.items():
-        text = file.read_text()
-        file.write_text(text.replace(f"id: cam{c}\n", f"id: cam{c}\n  fps: {rate}\n"))
-        assert file.read_text() != text
+        text = (match / "match.yaml").read_text()
+        assert f"id: cam{c}\n" in text
+        text = text.replace(f"id: cam{c}\n", f"id: cam{c}\n  fps: {rate}\n")
+        (match / "match.yaml").write_text(text)
     said = succeed("run", match, "--project", project, "--until", "retriangulation")
     assert "camera cam" not in said.err + said.out
-    run = open_run(str(project), "match")
-    check = run.record.figures["camera_consistency/clip"]
+    figures = open_run(str(project), "match").record.figures
+    check = figures["camera_consistency/clip"]
     assert (check["cameras_wrong"], check["contradictions"]) == (0, 0)
-    assert run.record.figures["triangulation/clip"]["unhealthy_share"] == 0.0
-    succeed("export", "match", "--format", "joints", "--project", project, "--out", out)
-    found, true = read_joints(out / "joints.npz"), joints(np.arange(FRAMES) / FPS)
+    assert figures["triangulation/clip"]["unhealthy_share"] == 0.0
+    succeed("export", "match", "--format", "joints", "--project", project, "--out", tmp_path)
+    found, true = read_joints(tmp_path / "joints.npz"), joints(np.arange(FRAMES) / FPS)
     assert len(found.person_ids) == true.shape[1]
     off = apart_from(found, true)
     known = np.isfinite(off).all(axis=-1)
@@ -93,41 +86,8 @@ def test_cameras_of_a_mixed_rig_are_right_and_their_people_in_their_regions(
     assert (squared < 7.81).mean() > 0.9  # of 95 %: noise of detectors lasts longer than this one
 
 
-@pytest.mark.slow
-def test_two_cameras_on_a_mast(server, tiny, tmp_path):
-    joints = read_joints(tiny / "reference" / "joints.npz").joints
-    joints = joints - [*joints[..., :2].mean(axis=(0, 1, 2)), 0.0]
-    rng, places = np.random.default_rng(1), ([-0.3, -30.0, 3.0], [0.3, -30.0, 3.0])
-    middle = [0.0, 0.0, 1.0]
-    cameras = {
-        f"cam{n}": look_at_camera(p, middle, 2500.0, (1280, 720)) for n, p in enumerate(places)
-    }
-    pixels = {name: seen_by(camera, joints, rng) for name, camera in cameras.items()}
-    match, project = (
-        import_people(tmp_path, cameras, pixels, 25),
-        ("--project", tmp_path / "project"),
-    )
-    spec = match / "match.yaml"
-    spec.write_text(spec.read_text().replace("pitch: none\n", ""))  # they stand on a pitch
-    answer = worldpose("run", match, *project)
-    assert answer.code == 4, answer.err
-    assert "contradicts" not in answer.err + answer.out
-    succeed("report", "match", *project, "--out", tmp_path / "report.html", "--no-videos")
-    assert "<td>plane</td>" in (tmp_path / "report.html").read_text()
-    succeed("export", "match", *project, "--format", "positions", "--out", tmp_path / "out")
-    with (tmp_path / "out/positions/clip.csv").open() as file:
-        rows = [(int(r["frame"]), float(r["x_m"]), float(r["y_m"])) for r in csv.DictReader(file)]
-    assert len(rows) > 30
-    hips = joints[:, :, 11:13, :2].mean(axis=2)
-    off = [np.linalg.norm(hips[frame] - place, axis=-1).min() for frame, *place in rows]
-    # A foot is known within 6 cm in height, seen from 3 m above the ground at 33 m.
-    assert np.median(off) < 0.06 * 33.0 / 3.0
-
-
 CLIP_FRAMES, CLIP_FPS, BAD = 125, 25, "cam2"
 KNOCK = np.array([25.0, -12.0])
-MIDDLE = np.array([960.0, 540.0])
-"""Of the images [px]."""
 
 
 @pytest.fixture
@@ -164,6 +124,7 @@ def run_to_triangulation(match, joints):
     return said.err + said.out, 1000.0 * np.nanmean(np.linalg.norm(off, axis=-1))
 
 
+@pytest.mark.slow  # unit/triangulation has its change, test_changing_views its files
 def test_a_knocked_camera_is_named_corrected_and_labelled_where_it_looks(imported, clip_joints):
     match = imported(lambda pixels: np.concatenate([pixels[:60], pixels[60:] + KNOCK]))
     said, error = run_to_triangulation(match, clip_joints)
@@ -175,14 +136,9 @@ def test_a_knocked_camera_is_named_corrected_and_labelled_where_it_looks(importe
     assert 0.4 < bad[2] == figures["unhealthy_share"] < 0.6
     assert max(bad[n] for n in (0, 1, 3)) < 0.05
     assert 55 <= figures["unhealthy_from_frame.cam2"] <= 65
-    usability = opened.record.usability
-    assert usability.verdict == "usable with reservations"
-    assert any("camera cam2 moves at frame 60" in each for each in usability.reservations)
+    assert "camera cam2 moves at frame 60" in str(opened.record.usability.reservations)
     after = judge_health(opened["retriangulation/clip"]["health"].values)
     assert (after > 1.0).mean() < 0.02  # corrected
-    store = Store.open(match.parent / "project")
-    (picture,) = health_picture(opened, open_match(store, "match"), "clip")
-    assert "cam2 moves at frame 60, by 27 px" in picture.caption
     given = json.loads((match.parent / "poses/cam2.json").read_text())
     written = json.loads((match.parent / "out/cam2.json").read_text())["annotations"]
     for frame in (30, 100):
@@ -192,17 +148,6 @@ def test_a_knocked_camera_is_named_corrected_and_labelled_where_it_looks(importe
         )
         apart = np.linalg.norm(shown[:, None, :, :2] - seen[None, :, :, :2], axis=-1)
         assert apart.mean(axis=-1).min(axis=1).max() < 3.0
-
-
-@pytest.mark.slow
-def test_a_zoom_is_told_and_hides_no_knock_of_another_camera(imported, clip_joints):
-    match = imported(
-        lambda pixels: np.concatenate([pixels[:60], 1.2 * (pixels[60:] - MIDDLE) + MIDDLE]),
-        cam0=lambda pixels: np.concatenate([pixels[:90], pixels[90:] + KNOCK]),
-    )
-    said, _ = run_to_triangulation(match, clip_joints)
-    assert "camera cam2: it moves within the clip" in said
-    assert "camera cam0 moves at frame 90" in said
 
 
 @pytest.mark.slow
@@ -268,6 +213,7 @@ def test_joints_of_fisheye_cameras_are_within_the_noise_of_the_truth(exported):
     assert (error < 1.5 * noise_m).all(), (error, noise_m)
 
 
+@pytest.mark.slow  # test_release_formats has the lenses of exports
 def test_exports_say_the_lens_and_independent_readers_find_the_pixels(exported):
     cameras, _, out = exported
     errors = json.loads((out / "lens_errors.json").read_text())

@@ -9,6 +9,8 @@ from data_contracts.run import UnitFailure
 from flows.openlineage import lineage_events, tell_lineage
 from worldpose.store.store import Store
 
+KINDS = ("START", "COMPLETE", "FAIL")
+
 
 @pytest.fixture
 def store(tiny_run):
@@ -24,9 +26,10 @@ def record(store):
 def test_every_result_leads_back_to_the_files_of_the_match(store, record):
     events = list(lineage_events(store, record))
     assert len(events) == 2 * (len(record.executed) + 1)
-    done = {each["job"]["name"]: each for each in events if each["eventType"] == "COMPLETE"}
-    assert len(done) == len(record.executed)
-    made = {each["outputs"][0]["name"]: each for each in done.values()}
+    kinds = {kind: [e for e in events if e["eventType"] == kind] for kind in KINDS}
+    done = kinds["COMPLETE"]
+    assert len({each["job"]["name"] for each in done}) == len(done) == len(record.executed)
+    made = {each["outputs"][0]["name"]: each for each in done}
     versions = {
         name: each["outputs"][0]["facets"]["version"]["datasetVersion"]
         for name, each in made.items()
@@ -36,17 +39,15 @@ def test_every_result_leads_back_to_the_files_of_the_match(store, record):
     def sources(name):
         inputs = made[name]["inputs"]
         found = {each["name"] for each in inputs if each["namespace"] == "worldpose.match"}
-        results = [each for each in inputs if each["namespace"] != "worldpose.match"]
-        assert all(versions[each["name"]] for each in results)
-        return found.union(*(sources(each["name"]) for each in results))
+        results = [each["name"] for each in inputs if each["namespace"] != "worldpose.match"]
+        assert all(versions[each] for each in results)
+        return found.union(*map(sources, results))
 
     assert sources(f"results/{TINY}/body_fitting/clip")
-    started = [each for each in events if each["eventType"] == "START"]
-    assert {each["run"]["runId"] for each in started} == {each["run"]["runId"] for each in events}
-    for each in done.values():
-        (start,) = [one for one in started if one["run"] == each["run"]]
-        assert start["eventTime"] < each["eventTime"]
-    (failed,) = [each for each in events if each["eventType"] == "FAIL"]
+    starts = {each["run"]["runId"]: each["eventTime"] for each in kinds["START"]}
+    assert starts.keys() == {each["run"]["runId"] for each in events}
+    assert all(starts[each["run"]["runId"]] < each["eventTime"] for each in done)
+    (failed,) = kinds["FAIL"]
     assert failed["run"]["facets"]["errorMessage"]["message"] == "no body"
     assert len({each["run"]["facets"]["parent"]["run"]["runId"] for each in events}) == 1
 

@@ -1,19 +1,17 @@
 """Prefect and Dask as processes: what is lost is named, work is spread, changes are repeated."""
 
-import json
 import math
 import os
 import subprocess
 import sys
 import time
-import urllib.request
 from contextlib import closing
 from pathlib import Path
 
 import dask
 import httpx
 import pytest
-from command_line import TINY, succeed, worldpose
+from command_line import TINY, succeed
 from distributed import Client, LocalCluster, Worker, get_worker
 from distributed.client import FutureCancelledError
 from distributed.comm.core import CommClosedError
@@ -32,7 +30,6 @@ from flows.orchestration.prefect_environment import (
 )
 from flows.orchestration.prefect_server import REPETITIONS, RepeatBusy
 from worldpose.errors import WorldposeError
-from worldpose.store.store import Store
 
 LOOPBACK_ONLY = str(Path(__file__).with_name("loopback_only"))
 
@@ -59,56 +56,17 @@ def test_an_embedded_run_reaches_nothing_but_this_machine(no_server, tiny, tmp_p
 
 def test_a_run_is_visible_at_the_server_by_name(server, tiny, tmp_path):
     succeed("run", tiny, "--project", tmp_path / "worldpose-data", "--until", "ingest")
+    login = {"authorization": authorization(os.environ[CLIENT_LOGIN])}
 
     def ask(kind):
-        request = urllib.request.Request(
-            f"{server}/{kind}/filter",
-            data=b'{"sort": "EXPECTED_START_TIME_DESC", "limit": 50}',
-            headers={
-                "content-type": "application/json",
-                "authorization": authorization(os.environ[CLIENT_LOGIN]),
-            },
-        )
-        with urllib.request.urlopen(request) as answer:
-            return json.load(answer)
+        asked = {"sort": "EXPECTED_START_TIME_DESC", "limit": 50}
+        return httpx.post(f"{server}/{kind}/filter", json=asked, headers=login).json()
 
     run = ask("flow_runs")[0]
     assert (run["name"], run["state_name"]) == (TINY, "Completed")
     assert run["parameters"]["match_id"] == TINY
     tasks = {task["name"] for task in ask("task_runs") if task["flow_run_id"] == run["id"]}
     assert any(name.startswith("ingest") for name in tasks)
-
-
-@pytest.mark.slow
-def test_a_damaged_input_fails_its_unit_and_repair_mends_it(server, tiny, tmp_path):
-    project = tmp_path / "worldpose-data"
-    succeed("run", tiny, "--project", project, "--until", "tracking")
-    chunks = (project / "results" / TINY / "tracking").rglob("detection_index/c/*/*/*")
-    chunk = next(path for path in chunks if path.is_file())
-    spoilt = bytearray(chunk.read_bytes())
-    spoilt[-1] ^= 1
-    chunk.write_bytes(spoilt)
-    joints = ("--until", "triangulation")
-    answer = worldpose("run", tiny, "--project", project, *joints)
-    assert answer.code == 1
-    assert "triangulation/clip" in answer.err
-    assert "detection_index" in answer.err
-    record = Store.open(str(project)).run(TINY)
-    assert record.state == "failed"
-    assert [failure.unit for failure in record.failed] == ["triangulation/clip"]
-    lost = succeed("why", f"{TINY}/tracking/clip", "--project", project, "--json").json
-    assert lost["state"] == "current"
-    # Mending it: the damaged result is withdrawn and computed again.
-    assert worldpose("verify", "--repair", "--project", project).code == 1
-    lost = succeed("why", f"{TINY}/tracking/clip", "--project", project, "--json").json
-    assert lost["state"] == "missing"
-    status = succeed("status", "--project", project, "--json").json["matches"][0]["units"]
-    assert status["missing"] == [
-        *("tracking/clip", "triangulation/clip", "bundle_adjustment/cameras"),
-        *("retriangulation/clip", "body_fitting/clip", "filtering/clip"),
-    ]
-    again = succeed("run", tiny, "--project", project, *joints, "--json").json
-    assert (again["executed"], again["failed"]) == (2, 0)
 
 
 @pytest.mark.parametrize(
@@ -192,11 +150,9 @@ def test_work_goes_to_workers_with_the_tag_where_there_are_any(tag, places, clus
 @pytest.mark.parametrize(
     ("seconds", "workers", "tasks"),
     [
-        (17 * [0.35], 1, 1),
         (17 * [0.8], 1, 3),
         (17 * [0.35], 4, 4),
         (3 * [0.35], 4, 3),
-        (17 * [14.0], 1, 17),
         (16 * [0.35] + [math.inf], 1, 17),
         (9000 * [0.35], 1, 200),
         (500 * [math.inf], 2, 40),
@@ -235,18 +191,12 @@ def send(app):
     return client.post("/create", json={"run": 1})
 
 
-@pytest.mark.parametrize("refusals", [0, 1, REPETITIONS])
-def test_a_refused_change_is_made_again_as_it_was(busy_server, refusals):
+@pytest.mark.parametrize("refusals", [1, REPETITIONS, 100])
+def test_a_refused_change_is_made_again_as_it_was_until_that_is_told(busy_server, refusals):
     busy_server.state.refusals = refusals
-    answer = send(busy_server)
-    assert (answer.status_code, answer.json()) == (201, {"number": refusals + 1})
-    assert busy_server.state.got == [{"run": 1}] * (refusals + 1)
-
-
-def test_a_database_that_stays_busy_is_told(busy_server):
-    busy_server.state.refusals = 100
-    assert send(busy_server).status_code == 503
-    assert len(busy_server.state.got) == REPETITIONS + 1
+    answer, sent = send(busy_server), min(refusals, REPETITIONS) + 1
+    assert answer.status_code == (201 if refusals <= REPETITIONS else 503)
+    assert busy_server.state.got == [{"run": 1}] * sent
 
 
 def test_another_error_is_passed_on_once(busy_server):

@@ -2,7 +2,6 @@
 
 import dataclasses
 import http.client
-import json
 import os
 import sqlite3
 import ssl
@@ -16,9 +15,8 @@ from urllib.parse import urlsplit
 import psutil
 import pytest
 from distributed import Client, Security
+from listeners import listening, says_nothing
 
-from flows.cli import console
-from flows.cli.serve import _print_addresses
 from flows.orchestration import prefect_environment
 from flows.orchestration.prefect_environment import (
     AUTHORITIES,
@@ -31,14 +29,12 @@ from flows.orchestration.prefect_environment import (
     local_cluster_options,
     one_authority,
     prefect_server,
-    require_login,
     without_secrets,
 )
 from flows.orchestration.private_cluster import PrivateCluster
 from flows.service.child import PARTS
 from flows.service.plan import METRICS_TOKEN, ServePlan, secrets_of
 from flows.service.serving import environment_of
-from worldpose.errors import InputError
 
 
 @pytest.fixture
@@ -119,25 +115,6 @@ def test_a_prefect_server_without_a_login_does_not_start():
     assert "openssl" in said.stderr
 
 
-def test_addresses_and_remarks_of_a_service_are_apart_in_its_json(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(console.output, "quiet", True)
-    plan = ServePlan(
-        project=str(tmp_path), inbox=tmp_path, state=tmp_path / "state", prefect="http://x:1/api"
-    )
-    _print_addresses(plan, "http://x:2/login", "this address", asks_for_login=True)
-    told = json.loads(capsys.readouterr().out)
-    assert (told["pages"], told["Prefect"]) == ("http://x:2/login", plan.dashboard)
-    assert told["remarks"]["pages"] == "open it in a browser; the token is in this address"
-
-
-def test_a_server_that_asks_for_another_login_is_named(server, monkeypatch):
-    require_login(server)
-    for login, found in (("worldpose:wrong", "another"), ("", "none")):
-        monkeypatch.setenv(CLIENT_LOGIN, login)
-        with pytest.raises(InputError, match=f"{CLIENT_LOGIN}: .*found {found}.*{SERVER_LOGIN}"):
-            require_login(server)
-
-
 def test_secrets_go_to_the_parts_that_need_them(tmp_path, monkeypatch):
     database = "PREFECT_API_DATABASE_CONNECTION_URL"
     secret = "WORLDPOSE_ALERT_URL WORLDPOSE_ALERT_MAIL AWS_ACCESS_KEY_ID AWS_SECRET_ACCESS_KEY"
@@ -191,19 +168,8 @@ def test_secrets_go_to_the_parts_that_need_them(tmp_path, monkeypatch):
     assert (tmp_path / "state" / "secrets" / "prefect").stat().st_mode & 0o777 == 0o600
 
 
-def listening():
-    """Ports at which this process and those that it started listen."""
-    here = psutil.Process()
-    connections = [
-        each
-        for process in [here, *here.children(recursive=True)]
-        for each in process.net_connections("inet")
-    ]
-    return {each.laddr.port for each in connections if each.status == psutil.CONN_LISTEN}
-
-
 def test_own_workers_serve_their_run_alone():
-    before = listening()
+    before = listening(psutil.Process())
     with PrivateCluster(**local_cluster_options(1)) as cluster, Client(cluster) as client:
         assert client.submit(sum, [1, 2]).result() == 3
         address = cluster.scheduler_address
@@ -213,13 +179,9 @@ def test_own_workers_serve_their_run_alone():
         with pytest.raises(OSError):
             Client(address.replace("tls://", "tcp://"), **plain)
         # Scheduler, nanny and worker listen, each with TLS.
-        ports = listening() - before
+        ports = listening(psutil.Process()).keys() - before.keys()
         assert len(ports) == 3
-        for port in ports:
-            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-            with pytest.raises((http.client.HTTPException, OSError)):
-                connection.request("GET", "/health")
-                connection.getresponse()
+        assert all(map(says_nothing, ports))
 
 
 def test_one_authority_is_read_by_those_on_this_machine_who_talk_plainly(tmp_path, monkeypatch):

@@ -6,7 +6,6 @@ import os
 import sys
 import threading
 import time
-from pathlib import Path
 
 import page_client
 import pytest
@@ -44,13 +43,8 @@ def refused(browser, method, path, **keywords):
 
 def test_every_route_but_log_in_and_health_refuses_a_stranger(app, stranger):
     routes = list(every_route(app))
-    assert {path for _, path in routes} >= {
-        MATCH,
-        f"{MATCH}/decisions",
-        "/",
-        "/api/session",
-        "/api/drafts",
-    }
+    some = {MATCH, f"{MATCH}/decisions", "/", "/api/session", "/api/drafts"}
+    assert {path for _, path in routes} >= some
     for method, path in routes:
         answer = refused(stranger, method, path, json={} if method == "POST" else None)
         if path in OPEN:
@@ -71,12 +65,8 @@ def test_a_wrong_token_a_forged_session_and_one_that_is_over_open_nothing(app, s
     other = access_for("127.0.0.1", token="another token, as long", names=(), secure=False)
     over = access.session("Ada", now=0.0)
     last = "0" if signature[-1] != "0" else "1"
-    forged = [
-        f"{packed}.{signature[:-1]}{last}",
-        f"{packed[:-2]}.{signature}",
-        other.session("Ada"),
-    ]
-    for cookie in [*forged, over, "", ".", "%%", "é"]:
+    forged = [f"{packed}.{signature[:-1]}{last}", f"{packed[:-2]}.{signature}"]
+    for cookie in [*forged, other.session("Ada"), over, "", ".", "%%", "é"]:
         assert access.person(cookie) is None
     for cookie in (forged[0], over):
         answer = stranger.get(MATCH, headers={"cookie": f"{access.cookie}={cookie}"})
@@ -120,17 +110,21 @@ def test_a_change_needs_the_form_secret_json_and_this_origin(ada, tiny_run):
     assert "access-control-allow-origin" not in ada.get("/api/matches").headers
 
 
-def test_nothing_is_changed_by_getting(project_copy):
+def test_nothing_is_changed_by_getting(project_copy, monkeypatch):
+    report = lambda store, match, file, **given: file.write_text("a page")  # noqa: E731
+    monkeypatch.setattr("flows.web.results.write_report", report)  # it takes seconds
     app = page_client.served(project_copy)
     ada = page_client.log_in(app, "Ada")
-    files = [path for path in Path(str(project_copy)).rglob("*") if path.is_file()]
-    before = {path: path.read_bytes() for path in files}
+
+    def files():
+        return {path: path.read_bytes() for path in project_copy.rglob("*") if path.is_file()}
+
+    before = files()
     answers = {
         path: ada.get(path).status_code for method, path in every_route(app) if method == "GET"
     }
     assert answers[MATCH] == answers[f"{MATCH}/results"] == 200
-    after = [path for path in Path(str(project_copy)).rglob("*") if path.is_file()]
-    assert {path: path.read_bytes() for path in after} == before
+    assert files() == before
 
 
 def test_a_name_that_leads_here_by_rebinding_is_refused(ada):
@@ -213,16 +207,13 @@ def test_a_slow_guesser_locks_nobody_out():
     assert access.guesser("Ada", "forged.0123") == ""
 
 
-@pytest.mark.parametrize(("mode", "is_private"), [(0o600, True), (0o400, True), (0o644, False)])
-def test_a_key_that_others_can_read_is_refused(mode, is_private, tmp_path):
+def test_a_key_that_others_can_read_is_refused(tmp_path):
     key = tmp_path / "key.pem"
-    key.touch()
-    key.chmod(mode)
-    if is_private:
-        assert certificate_and_key(tmp_path / "cert.pem", key)
-    else:
-        with pytest.raises(UsageError, match=r"mode 644.*chmod 600"):
-            certificate_and_key(tmp_path / "cert.pem", key)
+    key.touch(0o600)
+    assert certificate_and_key(tmp_path / "cert.pem", key)
+    key.chmod(0o644)
+    with pytest.raises(UsageError, match=r"mode 644.*chmod 600"):
+        certificate_and_key(tmp_path / "cert.pem", key)
 
 
 def test_a_name_that_would_forge_a_log_line_logs_nobody_in(stranger, caplog):
@@ -259,16 +250,11 @@ def test_listening_to_other_machines_needs_a_token_and_a_name():
 
 
 def test_every_answer_forbids_what_pages_do_not_need(ada, stranger):
-    for browser, path in (
-        (ada, "/"),
-        (ada, "/api/matches"),
-        (stranger, "/login"),
-        (stranger, "/x"),
-    ):
-        policy = browser.get(path).headers["content-security-policy"]
-        assert "default-src 'none'" in policy
-        assert "unsafe" not in policy
-        assert browser.get(path).headers["x-content-type-options"] == "nosniff"
+    asked = ((ada, "/"), (ada, "/api/matches"), (stranger, "/login"), (stranger, "/x"))
+    for headers in (browser.get(path).headers for browser, path in asked):
+        policy = headers["content-security-policy"]
+        assert "default-src 'none'" in policy and "unsafe" not in policy
+        assert headers["x-content-type-options"] == "nosniff"
 
 
 ASCENDING = ["%2e%2e", "..%2f..%2fetc", "%2Fetc%2Fpasswd", "....//", "..%5c..", "%00", "a/../b"]
@@ -341,27 +327,26 @@ def users_file(folder, text=USERS, mode=0o600):
     return file
 
 
-def test_people_of_a_file_may_do_what_their_role_says(project_copy, tmp_path):
-    def access():
-        file = tmp_path / "users.toml"
+def test_people_of_a_file_may_do_what_their_role_says(store, tmp_path):
+    def access(text=USERS):
+        file = users_file(tmp_path, text)
         return access_for("127.0.0.1", token=TOKEN, names=(), secure=False, users=file)
 
-    users_file(tmp_path)
-    served = create_app(str(project_copy), access())
+    served = create_app(store.url, access())
 
     def enter(who, token):
         person = page_client.browser(served)
         answer = person.post("/api/login", json={"who": who, "token": token})
         if answer.status_code != 200:
-            return None
+            return None, None
         session = person.get("/api/session").json()
         assert session["who"] == who
         person.headers["x-form-secret"] = session["form_secret"]
         return person, session["role"]
 
-    assert enter("Vera", "the token of Ann...") is None
-    assert enter("Vera", TOKEN) is None  # the server's own token admits no user
-    assert enter("Eve", TOKEN) is None
+    # The server's own token admits no user.
+    for who, token in (("Vera", "the token of Ann..."), ("Vera", TOKEN), ("Eve", TOKEN)):
+        assert enter(who, token) == (None, None)
     vera, role = enter("Vera", "the token of Vera..")
     assert role == "viewer"
     ann, role = enter("Ann", "the token of Ann...")
@@ -373,15 +358,14 @@ def test_people_of_a_file_may_do_what_their_role_says(project_copy, tmp_path):
     refusal = vera.post(f"{MATCH}/corrections", json=edit)
     assert refusal.status_code == 403 and "viewer" in refusal.json()["error"]
     assert ann.post(f"{MATCH}/corrections", json=edit).status_code == 200
-    *_, last = read_journal(Store.open(str(project_copy)), TINY).records
+    *_, last = read_journal(store, TINY).records
     assert last.who == "Ann"
     assert {"/corrections", "/interpolation", "/acceptances"} <= set(EDITING)
     changing = {path for method, path in every_route(served) if method != "GET"} - OPEN
     for path in changing - {"/api/logout"}:
         is_preview = path.endswith("/preview")
-        is_edit = path.endswith(EDITING)
         codes = [each.post(path, json={"no": 1}).status_code for each in (vera, ann, ake)]
-        may = [is_preview, is_preview or is_edit, True]
+        may = [is_preview, is_preview or path.endswith(EDITING), True]
         assert [code != 403 for code in codes] == may, path
     assert vera.get(MATCH).status_code == 200
     # A session ends with the person's entry, or with another token of the person.
@@ -389,10 +373,8 @@ def test_people_of_a_file_may_do_what_their_role_says(project_copy, tmp_path):
     assert before.person(before.session("Eve")) is None
     session = before.session("Ann")
     assert before.person(session) == "Ann"
-    users_file(tmp_path, USERS.replace("of Ann...", "of Ann, new"))
-    assert access().person(session) is None
-    users_file(tmp_path, USERS.replace("Ann", "Anne"))
-    assert access().person(session) is None
+    for old, new in (("of Ann...", "of Ann, new"), ("Ann", "Anne")):
+        assert access(USERS.replace(old, new)).person(session) is None
 
 
 @pytest.mark.parametrize(
@@ -407,10 +389,9 @@ def test_people_of_a_file_may_do_what_their_role_says(project_copy, tmp_path):
     ],
 )
 def test_a_bad_file_of_users_is_refused_without_its_tokens(text, mode, problem, tmp_path):
+    users = users_file(tmp_path, text, mode)
     with pytest.raises(UsageError, match=problem) as refusal:
-        access_for(
-            "127.0.0.1", token=None, names=(), secure=False, users=users_file(tmp_path, text, mode)
-        )
+        access_for("127.0.0.1", token=None, names=(), secure=False, users=users)
     assert "the token of" not in str(refusal.value) and "a secret" not in str(refusal.value)
 
 

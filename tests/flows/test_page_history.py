@@ -28,12 +28,11 @@ from flows.web.evidence import asked_run, thin_curve
 from flows.web.history import _find_cause
 from worldpose.errors import InputError
 from worldpose.review.journal import say
-from worldpose.store.store import Store, open_run
+from worldpose.store.store import open_run
 from worldpose.video.files import VideoReader
 
 
-def test_runs_are_listed_compared_and_kept_by_name(ada, project_copy, monkeypatch):
-    store = Store.open(str(project_copy))
+def test_runs_are_listed_compared_and_kept_by_name(ada, store, monkeypatch):
     first = store.run(TINY)
     figures = {name: dict(each) for name, each in first.figures.items()}
     figures["static_calibration/cam00"]["expected_ground_error_median_m"] *= 2.0
@@ -88,63 +87,55 @@ def test_what_is_withdrawn_later_changes_no_cause_of_a_run():
 
 def test_a_run_is_cancelled(ada, monkeypatch):
     assert ada.post(f"{MATCH}/cancellation", json={}).status_code == 409
-    begin = "import os, signal, time; signal.signal(2, signal.SIG_DFL); "  # as from a terminal
-    sleep = [sys.executable, "-c", begin + "time.sleep(90)"]
-    monkeypatch.setattr(app_context, "_COMMAND", sleep)
-    ada.post(f"{MATCH}/runs", json={}).raise_for_status()
-    begun = time.monotonic()
-    assert ada.post(f"{MATCH}/cancellation", json={}).status_code == 200  # before its process too
-    while (ada.get(MATCH).json()["at_work"] or {}).get("state") == "running":
-        assert time.monotonic() - begun < 40
-        time.sleep(0.2)
-    ended = ada.get(MATCH).json()["at_work"]
-    assert ended["code"] == 130  # as the command itself ends
+
+    def ended(script, *further):
+        script = f"import os, signal, time; signal.signal(2, signal.SIG_DFL); {script}"
+        monkeypatch.setattr(app_context, "_COMMAND", [sys.executable, "-c", script])
+        for path in ("runs", *further):
+            ada.post(f"{MATCH}/{path}", json={}).raise_for_status()
+        end = time.monotonic() + 40.0
+        while (found := ada.get(MATCH).json()["at_work"])["state"] == "running":
+            assert time.monotonic() < end
+            time.sleep(0.2)
+        return found
+
+    cancelled = ended("time.sleep(90)", "cancellation")  # before its process has begun, too
+    assert cancelled["code"] == 130  # as the command itself ends
     stopped = MatchSummary(match_id="m", kind="stopped", words="stopped before its end")
-    said = app_context.say_cancelled(stopped, ended)
+    said = app_context.say_cancelled(stopped, cancelled)
     assert (said.words, "by Ada. Its finished steps" in said.why) == ("cancelled", True)
-    assert app_context.say_cancelled(stopped, {**ended, "code": 1}) == stopped
-    killed = [sys.executable, "-c", begin + "os.kill(os.getpid(), 2); time.sleep(9)"]
-    monkeypatch.setattr(app_context, "_COMMAND", killed)
-    ada.post(f"{MATCH}/runs", json={}).raise_for_status()
-    while ada.get(MATCH).json()["at_work"]["state"] == "running":
-        assert time.monotonic() - begun < 80
-        time.sleep(0.2)
-    assert ada.get(MATCH).json()["at_work"]["code"] == -2  # by nobody here
+    killed = ended("os.kill(os.getpid(), 2); time.sleep(9)")
+    assert killed["code"] == -2  # by nobody here
+    assert app_context.say_cancelled(stopped, killed) == stopped
 
 
 def test_a_run_that_cannot_start_has_its_reason_and_delays_no_other(store, monkeypatch):
     full, real = ["first"], app_context.tempfile.mkdtemp
 
     def make(**given):
-        if full.pop() if full else "":
+        if full and full.pop():
             raise OSError(28, "No space left on device")
         return real(**given)
 
     monkeypatch.setattr(app_context.tempfile, "mkdtemp", make)
     monkeypatch.setattr(app_context, "_COMMAND", [sys.executable, "-c", "print('ran')"])
-    runs, first = app_context.LocalRuns(store), store.run(TINY)
-    begun = time.monotonic()
-    for name in ("first", "second"):
+    runs, said = app_context.LocalRuns(store), {}
+    for name in ("first", "second", TINY):
         runs.go_on(name, None)
+        end = time.monotonic() + 40.0
         while runs.state(name)["state"] == "running":
-            assert time.monotonic() - begun < 40
+            assert time.monotonic() < end
             time.sleep(0.05)
-    assert "No space left" in runs.state("first")["lines"][0]
-    assert runs.state("second")["lines"] == ["ran"]
+        said[name] = runs.state(name)["lines"]
+    assert "No space left" in said["first"][0] and said["second"] == ["ran"]
     # What ended here is old news once the match has run elsewhere.
-    runs.go_on(TINY, None)
-    while runs.state(TINY)["state"] == "running":
-        assert time.monotonic() - begun < 40
-        time.sleep(0.05)
     done = {"run_id": store.reserve_run(TINY), "finished_at": datetime.now(UTC)}
-    store.finish_run(first.model_copy(update=done))
+    store.finish_run(store.run(TINY).model_copy(update=done))
     assert runs.state(TINY) is None
 
 
-def test_a_keypoint_is_filled_in_between_two_corrections(ada, project_copy):
-    store = Store.open(str(project_copy))
-    match = open_match(store, TINY)
-    found = identities_now(store, match, "clip").identities
+def test_a_keypoint_is_filled_in_between_two_corrections(ada, store):
+    found = identities_now(store, open_match(store, TINY), "clip").identities
     row, k = 5, int((found.detection_index[5:11] >= 0).all(axis=0).sum(axis=0).argmax())
     c = int(np.flatnonzero((found.detection_index[row : row + 6, :, k] >= 0).all(axis=0))[0])
     camera, path = found.cameras[c], f"{MATCH}/detections/{found.cameras[c]}/interpolation"
@@ -154,27 +145,23 @@ def test_a_keypoint_is_filled_in_between_two_corrections(ada, project_copy):
         seen = detections_now(store, open_match(store, TINY), camera, frame)
         return {"frame": frame, "detection": int(detection)}, seen.keypoints[0, detection]
 
+    def say(number, kind, offset, **more):
+        edit = {"kind": kind, "camera": camera, **place(offset)[0], **more}
+        edits = {"edits": [{"id": f"{kind}.{number}", "edit": edit}]}
+        return ada.post(f"{MATCH}/corrections", json=edits).status_code
+
     joint = int(np.isfinite(np.stack([place(n)[1] for n in range(6)])).all(axis=(0, 2)).argmax())
-    assert ada.post(path, json={**place(5)[0], "joint": COCO17[joint]}).status_code == 422
-    for odd in ({"joint": "zz"}, {"joint": COCO17[joint], "detection": 5000}):
-        assert ada.post(path, json={**place(5)[0], **odd}).status_code == 422
-    unknown = {"kind": "moved_keypoint", "camera": camera, **place(5)[0], "joint": "zz", "xy": None}
-    edits = {"edits": [{"id": "moved_keypoint.zz", "edit": unknown}]}
-    assert ada.post(f"{MATCH}/corrections", json=edits).status_code == 409
-    for number, (offset, xy) in enumerate(
-        # The last correction of a frame counts.
-        ((0, (700.0, 20.0)), (0, (100.0, 200.0)), (3, None), (5, (150.0, 210.0)))
-    ):
-        at, was = place(offset)
-        edit = {"kind": "moved_keypoint", "camera": camera, **at, "joint": COCO17[joint], "xy": xy}
-        edit["was"] = [float(value) for value in was[joint]]
-        edits = {"edits": [{"id": f"moved_keypoint.{number}", "edit": edit}]}
-        ada.post(f"{MATCH}/corrections", json=edits).raise_for_status()
-    gone = {"kind": "deleted_detection", "camera": camera, **place(4)[0]}
-    edits = {"edits": [{"id": "deleted_detection.4", "edit": gone}]}
-    ada.post(f"{MATCH}/corrections", json=edits).raise_for_status()
-    kept = ada.post(path, json={**place(5)[0], "joint": COCO17[joint]}).json()["kept"]
-    assert len(kept) == 2
+    asked = {**place(5)[0], "joint": COCO17[joint]}
+    for odd in ({}, {"joint": "zz"}, {"detection": 5000}):  # nothing is corrected yet
+        assert ada.post(path, json=asked | odd).status_code == 422
+    assert say("zz", "moved_keypoint", 5, joint="zz", xy=None) == 409
+    # The last correction of a frame counts.
+    moves = ((0, (700.0, 20.0)), (0, (100.0, 200.0)), (3, None), (5, (150.0, 210.0)))
+    for number, (offset, xy) in enumerate(moves):
+        given = {"joint": COCO17[joint], "xy": xy, "was": place(offset)[1][joint].tolist()}
+        assert say(number, "moved_keypoint", offset, **given) == 200
+    assert say(4, "deleted_detection", 4) == 200
+    assert len(ada.post(path, json=asked).json()["kept"]) == 2
     filled = [place(n)[1][joint].tolist() for n in (0, 1, 2, 5)]
     assert filled == [[100, 200], [110, 202], [120, 204], [150, 210]]
     assert np.isnan(place(3)[1][joint]).all()  # it was said to be invisible there
@@ -184,16 +171,14 @@ def test_a_keypoint_is_filled_in_between_two_corrections(ada, project_copy):
 @pytest.fixture
 def going_on(monkeypatch):
     asked = []
-    monkeypatch.setattr(
-        Continuing,
-        "go_on",
-        lambda self, name, gates=None: asked.append(name) or {"state": "running"},
-    )
+    go_on = lambda self, name, gates=None: asked.append(name) or {"state": "running"}  # noqa: E731
+    monkeypatch.setattr(Continuing, "go_on", go_on)
     return asked
 
 
-def waiting(store):
-    run_match(store, open_match(store, TINY), RunRequest({}, gates="auto"))
+def waiting(store, state="waiting"):
+    record = run_match(store, open_match(store, TINY), RunRequest({}, gates="auto"))
+    assert record.state == state
 
 
 def test_a_page_keeps_the_policy_of_a_run_that_did_not_come_to_the_end(ada, store, monkeypatch):
@@ -207,12 +192,11 @@ def test_a_page_keeps_the_policy_of_a_run_that_did_not_come_to_the_end(ada, stor
     assert asked == [None, "auto", "auto"]
 
 
-def test_the_run_goes_on_when_the_last_question_is_approved(ada, bob, project_copy, going_on):
-    waiting(Store.open(str(project_copy)))
+def test_the_run_goes_on_when_the_last_question_is_approved(ada, bob, store, going_on):
+    waiting(store)
     reviews = ada.get(MATCH).json()["reviews"]
-    assert len(reviews) > 1
     (row,) = (each for each in ada.get("/api/matches").json()["matches"] if each["match"] == TINY)
-    assert len(row["waiting"]) == len(reviews)
+    assert len(row["waiting"]) == len(reviews) > 1
     assert max(each["excess"] for each in row["waiting"]) > 0
     for number, each in enumerate(reviews):
         verdict = {"reviews": [each["id"]], "verdict": "approve", "seen": {each["id"]: "waits"}}
@@ -221,22 +205,13 @@ def test_the_run_goes_on_when_the_last_question_is_approved(ada, bob, project_co
     assert going_on == [TINY]
     # Bob's page still shows the question.
     answer = bob.post(f"{MATCH}/decisions", json={**verdict, "verdict": "reject", "why": "no"})
+    difference = answer.json()["difference"]
     assert answer.status_code == 409
-    assert (answer.json()["difference"]["now"], answer.json()["difference"]["who"]) == (
-        "approve",
-        "Ada",
-    )
-    assert (
-        run_match(
-            Store.open(str(project_copy)),
-            open_match(Store.open(str(project_copy)), TINY),
-            RunRequest({}, gates="auto"),
-        ).state
-        == "complete"
-    )
+    assert (difference["now"], difference["who"]) == ("approve", "Ada")
+    waiting(store, "complete")
 
 
-def test_a_run_that_is_answered_while_it_ends_is_run_once_more(project_copy, tmp_path, monkeypatch):
+def test_a_run_that_is_answered_while_it_ends_is_run_once_more(store, tmp_path, monkeypatch):
     ran, gate = tmp_path / "ran", tmp_path / "gate"
     ran.touch()
     script = (
@@ -246,7 +221,7 @@ def test_a_run_that_is_answered_while_it_ends_is_run_once_more(project_copy, tmp
     )
     monkeypatch.setattr(app_context, "_COMMAND", [sys.executable, "-c", script])
     monkeypatch.delenv("PREFECT_API_URL", raising=False)
-    runs = Continuing(Store.open(str(project_copy)))
+    runs = Continuing(store)
     for _ in range(3):  # the second and third come while the first is at work
         assert runs.go_on(TINY)["state"] == "running"
     gate.touch()
@@ -257,34 +232,29 @@ def test_a_run_that_is_answered_while_it_ends_is_run_once_more(project_copy, tmp
     assert runs.state(TINY)["code"] == 0
 
 
-def test_an_empty_verdict_approves_nothing(ada, project_copy, going_on):
-    waiting(Store.open(str(project_copy)))
+def test_an_empty_verdict_approves_nothing(ada, store, going_on):
+    waiting(store)
     name = ada.get(MATCH).json()["reviews"][0]["id"]
-    for body in ({}, {"reviews": [name]}, {"reviews": [name], "verdict": "", "seen": {}}):
-        assert ada.post(f"{MATCH}/decisions", json=body).status_code == 422
     nothing = {"reviews": [], "verdict": "approve", "seen": {}}
-    assert ada.post(f"{MATCH}/decisions", json=nothing).status_code == 422
+    for body in ({}, {"reviews": [name]}, {"reviews": [name], "verdict": "", "seen": {}}, nothing):
+        assert ada.post(f"{MATCH}/decisions", json=body).status_code == 422
     assert going_on == []
 
 
 def test_a_clip_is_accepted_with_its_video_and_its_figures_over_time(
-    ada, project_copy, tmp_path, monkeypatch
+    ada, store, tmp_path, monkeypatch
 ):
-    store = Store.open(str(project_copy))
-    key = store.run(TINY).results["body_fitting/clip"]
-    manifest = store.manifest(TINY, "body_fitting", "clip", key)
     unit, name = "body_fitting/clip", "body_fitting.clip.asked"
+    key = store.run(TINY).results[unit]
+    manifest = store.manifest(TINY, *unit.split("/"), key)
     about = {"keys": {unit: key}, "contents": {unit: manifest.content}, "gate": "body_fitting"}
     about |= {"reasons": ("every result is asked about",), "figures": manifest.figures}
-    question = review_request(name, match_id=TINY, **about)
-    say(store, TINY, lambda journal: [question])
-    path = f"{MATCH}/reviews/{question.id}"
-    run = open_run(str(project_copy), TINY)
-    match = open_match(store, TINY)
+    say(store, TINY, lambda journal: [review_request(name, match_id=TINY, **about)])
+    path, frames = f"{MATCH}/reviews/{name}", tmp_path / "cam02"
+    run, match = open_run(store.url, TINY), open_match(store, TINY)
     spec = match.folder.spec
     (clip,) = spec.clips
     assert clip_view(run, match, "clip") is None  # no camera of this match has a video
-    frames = tmp_path / "cam02"
     frames.mkdir()
     size = spec.camera("cam02")
     grey = np.full((size.height, size.width, 3), 90, dtype=np.uint8)
@@ -303,20 +273,18 @@ def test_a_clip_is_accepted_with_its_video_and_its_figures_over_time(
     assert (evidence["video"], evidence["tables"][-1]["rows"]) == (None, [["cam02"]])
     away.rename(frames)  # what was drawn without the images is not kept
     evidence = ada.get(f"{path}/evidence").json()
-    assert evidence["video"] == "cam02"
-    assert evidence["pictures"] and evidence["tables"]
+    assert evidence["video"] == "cam02" and evidence["pictures"] and evidence["tables"]
     assert (evidence["first_frame"], evidence["frames_per_value"]) == (clip.first_frame, 1)
     assert [len(each["values"]) for each in evidence["curves"]] == [clip.frame_count] * 4
-    assert max(evidence["curves"][0]["values"]) <= len(run["body_fitting/clip"]["person"])
+    assert max(evidence["curves"][0]["values"]) <= len(run[unit]["person"])
     answer = ada.get(f"{path}/video", headers={"range": "bytes=0-99"})
     assert (answer.status_code, answer.headers["content-type"]) == (206, "video/mp4")
     (tmp_path / "shown.mp4").write_bytes(ada.get(f"{path}/video").content)
     with VideoReader(tmp_path / "shown.mp4") as video:
         pictures = [picture for _, picture in video.frames()]
-    every = max(1, round(spec.fps / 25))
-    assert len(pictures) == len(range(0, clip.frame_count, every))
-    drawn = [np.ptp(picture.astype(int), axis=2).max() for picture in pictures]
-    assert min(drawn) > 40  # coloured lines over grey
+    assert len(pictures) == len(range(0, clip.frame_count, max(1, round(spec.fps / 25))))
+    # Coloured lines over grey.
+    assert min(np.ptp(picture.astype(int), axis=2).max() for picture in pictures) > 40
 
 
 def test_a_curve_of_a_long_clip_keeps_its_least_and_largest_values_in_order():

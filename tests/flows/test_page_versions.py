@@ -12,19 +12,7 @@ import page_client
 import pytest
 import yaml
 from command_line import TINY
-from test_page_drafts import (
-    DRAFTS,
-    FPS,
-    FRAMES,
-    SIZE,
-    a_match,
-    footage,  # noqa: F401
-    open_pages,
-    place,  # noqa: F401
-    put,
-    save,
-    settle,
-)
+from test_page_drafts import DRAFTS, FPS, FRAMES, SIZE, a_match, add, open_pages, save, settle
 
 from data_contracts.operations import MatchSummary
 from data_contracts.review import NamedTrack
@@ -39,14 +27,7 @@ from worldpose.errors import InputError
 from worldpose.store.store import Store
 
 
-def add(browser, draft, name, content):
-    new = {"name": name, "size": len(content), "modified_ms": 1}
-    answer = browser.post(f"{DRAFTS}/{draft}/files", json=new)
-    assert answer.status_code == 200, answer.text
-    assert put(browser, draft, answer.json()["file"], 0, content).status_code == 200
-
-
-def arrive(place, begun=None):  # noqa: F811
+def arrive(place, begun=None):
     """Take in what is complete in the inbox; return all arrivals by name."""
     store = Store.open(str(place / "project"))
     state = served_state(store.url)
@@ -62,7 +43,7 @@ def contents(folder):
 
 
 @pytest.fixture
-def final(place, footage):  # noqa: F811
+def final(place, footage):
     """The pages of a project with a match of one camera, and the folder of the match."""
     ada = open_pages(place)
     draft = ada.post(DRAFTS, json={}).json()["id"]
@@ -75,7 +56,7 @@ def final(place, footage):  # noqa: F811
     return ada, place / "inbox" / "final"
 
 
-def test_a_match_that_is_being_taken_in_waits_and_offers_no_run(place, final):  # noqa: F811
+def test_a_match_that_is_being_taken_in_waits_and_offers_no_run(place, final):
     store = Store.open(str(place / "project"))
     context = SimpleNamespace(store=store, registration=store.registration)
     state = served_state(store.url)
@@ -88,10 +69,7 @@ def test_a_match_that_is_being_taken_in_waits_and_offers_no_run(place, final):  
 
 
 def test_a_further_camera_makes_the_next_version_and_the_folder_before_stays(
-    place,  # noqa: F811
-    footage,  # noqa: F811
-    final,
-    monkeypatch,
+    place, footage, final, monkeypatch
 ):
     ada, folder = final
     before = contents(folder)
@@ -130,9 +108,8 @@ def clicks_of(camera):
     image = {"id": 0, "file_name": f"{camera}.jpg", "width": SIZE[0], "height": SIZE[1]}
     keypoints = {"id": 1, "name": "mark", "keypoints": ["center_mark"]}
     shown = {"id": 1, "image_id": 0, "category_id": 1, "keypoints": [40, 30, 2]}
-    return json.dumps(
-        {"images": [image], "categories": [keypoints], "annotations": [shown]}
-    ).encode()
+    content = {"images": [image], "categories": [keypoints], "annotations": [shown]}
+    return json.dumps(content).encode()
 
 
 def test_runs_and_names_outlast_the_next_version(project_copy, tiny):
@@ -175,17 +152,18 @@ def test_runs_and_names_outlast_the_next_version(project_copy, tiny):
     assert match_state(store, match).name == "outdated"
 
 
-def test_an_untouched_draft_is_no_change_where_match_yaml_names_no_video(place, footage):  # noqa: F811
-    ada, content = open_pages(place), a_match("", match_id="cup", camera={"side": "near"})
-    del content["cameras"][0]["video"]
-    shutil.copy(footage, refuse(place, content) / "videos" / "near_left.mp4")
+def test_an_untouched_draft_is_no_change_where_match_yaml_names_no_video(place, footage):
+    ada, folder = open_pages(place), cup(place)
+    text = (folder / "match.yaml").read_text()
+    (folder / "match.yaml").write_text(text.replace("  video: videos/near.mp4\n", ""))
+    shutil.copy(footage, folder / "videos" / "near_left.mp4")
     assert arrive(place)["cup"].state == "taken"
     draft = ada.post(DRAFTS, json={"match": "cup"}).json()["id"]
     (problem,) = settle(ada, draft)["problems"]
     assert problem["message"].startswith("nothing has changed yet")
 
 
-def test_a_match_whose_files_are_gone_is_no_draft(place, final):  # noqa: F811
+def test_a_match_whose_files_are_gone_is_no_draft(place, final):
     ada, folder = final
     for spoil, told in (
         (lambda: (folder / "notes").symlink_to(place / "nowhere"), "notes"),
@@ -198,28 +176,31 @@ def test_a_match_whose_files_are_gone_is_no_draft(place, final):  # noqa: F811
     assert list((place / "inbox" / ".drafts").iterdir()) == []
 
 
-def test_the_form_tells_the_broken_video_for_which_a_match_was_refused(place, footage):  # noqa: F811
-    ada = open_pages(place)
-    folder = refuse(place, a_match("videos/near.mp4", match_id="cup", camera={"side": "near"}))
+def test_the_form_tells_the_broken_video_for_which_a_match_was_refused(place, footage):
+    ada, folder = open_pages(place), cup(place)
     (folder / "videos" / "near.mp4").write_bytes(footage.read_bytes()[:300])
     assert arrive(place)["cup"].state == "refused"
     draft = ada.post(DRAFTS, json={"arrival": "cup"}).json()["id"]
-    (problem,) = settle(ada, draft, "broken")["problems"]
+    view = settle(ada, draft, "broken")
+    (problem,) = view["problems"]
     assert problem["place"] == "cameras[0].video" and "near.mp4" in problem["message"]
+    assert str(place) not in str(view)
 
 
-def refuse(place, match_yaml):  # noqa: F811
+def cup(place, video=None, **changes):
+    """A match in the inbox, of one camera from the near side."""
     folder = place / "inbox" / "cup"
     (folder / "videos").mkdir(parents=True)
-    (folder / "match.yaml").write_text(yaml.safe_dump(match_yaml))
+    about = {"match_id": "cup", "camera": {"side": "near"}, **changes}
+    (folder / "match.yaml").write_text(yaml.safe_dump(a_match("videos/near.mp4", **about)))
+    if video is not None:
+        shutil.copy(video, folder / "videos" / "near.mp4")
     return folder
 
 
-def test_a_refused_match_can_be_corrected_tried_again_or_removed(place, footage):  # noqa: F811
+def test_a_refused_match_can_be_corrected_tried_again_or_removed(place, footage):
     ada = open_pages(place)
-    wrong = a_match("videos/near.mp4", match_id="cup", camera={"side": "near"}, fps=-25)
-    folder = refuse(place, wrong)
-    shutil.copy(footage, folder / "videos" / "near.mp4")
+    cup(place, footage, fps=-25)
     assert arrive(place)["cup"].state == "refused"
     (shown,) = ada.get("/api/inbox").json()["arrivals"]
     assert "fps" in shown["reason"]
@@ -240,17 +221,14 @@ def test_a_refused_match_can_be_corrected_tried_again_or_removed(place, footage)
     assert open_for_review(Store.open(str(place / "project")), "cup").folder.spec.fps == FPS
 
 
-def test_a_match_taken_in_while_it_is_corrected_keeps_its_folder(place, footage):  # noqa: F811
-    ada = open_pages(place)
-    right = a_match("videos/near.mp4", match_id="cup", camera={"side": "near"})
-    folder = refuse(place, right | {"fps": -25})
-    shutil.copy(footage, folder / "videos" / "near.mp4")
+def test_a_match_taken_in_while_it_is_corrected_keeps_its_folder(place, footage):
+    ada, folder = open_pages(place), cup(place, footage, fps=-25)
     assert arrive(place)["cup"].state == "refused"
     draft = ada.post(DRAFTS, json={"arrival": "cup"}).json()["id"]
     view = settle(ada, draft)
+    right = a_match("videos/near.mp4", match_id="cup", camera={"side": "near"})
     clips = [{"id": "goal", "frame_count": FRAMES - 1}]
-    content = right | {"match_id": "another", "clips": clips}
-    assert save(ada, view, content).json()["is_ready"]
+    assert save(ada, view, right | {"match_id": "another", "clips": clips}).json()["is_ready"]
     (folder / "match.yaml").write_text(yaml.safe_dump(right))  # corrected where it is
     state, inbox = served_state(str(place / "project")), place / "inbox"
     watch_once(state, inbox, 0.0)
@@ -263,7 +241,7 @@ def test_a_match_taken_in_while_it_is_corrected_keeps_its_folder(place, footage)
     assert (folder / "match.yaml").exists() and not (inbox / "another").exists()
 
 
-def test_of_two_versions_at_the_same_time_one_arrives(place, final, monkeypatch):  # noqa: F811
+def test_of_two_versions_at_the_same_time_one_arrives(place, final, monkeypatch):
     ada, _ = final
     finish = []
     for priority in ("urgent", "normal"):
@@ -285,7 +263,7 @@ def test_of_two_versions_at_the_same_time_one_arrives(place, final, monkeypatch)
     assert sorted(answer.status_code for answer in answers) == [200, 422]
 
 
-def test_what_cannot_be_linked_has_to_fit_on_the_disk(place, final, monkeypatch):  # noqa: F811
+def test_what_cannot_be_linked_has_to_fit_on_the_disk(place, final, monkeypatch):
     ada, folder = final
     (folder / "notes.bin").write_bytes(bytes(LINKED_BYTES))
     usage = shutil.disk_usage(place)
@@ -304,23 +282,22 @@ def test_what_cannot_be_linked_has_to_fit_on_the_disk(place, final, monkeypatch)
     assert [each.exists() for each in half] == [False, False, True]
 
 
-def test_an_arrival_without_a_readable_match_yaml_is_a_form_with_its_files(place, footage):  # noqa: F811
-    ada = open_pages(place)
-    folder = refuse(place, a_match("videos/near.mp4", match_id="cup"))
-    shutil.copy(footage, folder / "videos" / "near.mp4")
-    for text in ("{", None):
-        (folder / "match.yaml").unlink()
-        if text is not None:
-            (folder / "match.yaml").write_text(text)
-        assert arrive(place)["cup"].state == ("incomplete" if text is None else "refused")
+def test_an_arrival_without_a_readable_match_yaml_is_a_form_with_its_files(place, footage):
+    ada, folder = open_pages(place), cup(place, footage)
+    for state in ("refused", "incomplete"):
+        (folder / "match.yaml").write_text("{")
+        if state == "incomplete":
+            (folder / "match.yaml").unlink()
+        assert arrive(place)["cup"].state == state
         draft = ada.post(DRAFTS, json={"arrival": "cup"}).json()["id"]
         assert [file["name"] for file in settle(ada, draft)["files"]] == ["videos/near.mp4"]
-        ada.post(f"{DRAFTS}/{draft}/removal", json={})
+        assert ada.post(f"{DRAFTS}/{draft}/removal", json={}).status_code == 200
+        assert ada.get(f"{DRAFTS}/{draft}").status_code == 422
+    assert list((place / "inbox" / ".drafts").iterdir()) == []
 
 
-def test_a_removed_arrival_is_kept_out_of_sight_and_one_with_a_link_is_no_draft(place):  # noqa: F811
-    ada = open_pages(place)
-    folder = refuse(place, a_match("videos/near.mp4", match_id="cup"))
+def test_a_removed_arrival_is_kept_out_of_sight_and_one_with_a_link_is_no_draft(place):
+    ada, folder = open_pages(place), cup(place)
     (folder / "videos" / "near.mp4").symlink_to("/etc/passwd")
     assert arrive(place)["cup"].state == "refused"
     answer = ada.post(DRAFTS, json={"arrival": "cup"})

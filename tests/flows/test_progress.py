@@ -77,8 +77,7 @@ def test_percent_and_time_left_of_stage_and_run_follow_the_expected_work(clock):
     assert str(heard.run_progress) == str(heard.stage_progress) == "100 %"
 
 
-def test_expected_work_comes_from_the_latest_run(project_copy):
-    store = Store.open(str(project_copy))
+def test_expected_work_comes_from_the_latest_run(store):
     match, latest = open_match(store, TINY), latest_run(store, TINY)
     units = [
         each
@@ -101,20 +100,19 @@ def test_a_second_run_of_a_match_at_work_is_refused_at_once(project_copy):
     with alone_with(store, TINY):
         pass  # it is this process's own
     path = next(project_copy.rglob(f"{run_id}.open.json"))
+    said = f"found run {run_id}, process {other.pid}, since"
     try:
         path.unlink()
         named = {"pid": other.pid, "process": identify_process(other.pid)}
         theirs = mine.model_copy(update={**named, "started_at": datetime.now(UTC)})
         store.blobs.put_new(str(path.relative_to(project_copy)), seal(theirs))
         answer = worldpose("run", TINY, "--project", project_copy)
-        assert answer.code == 1
-        assert answer.err.count("\n") == 1, answer.err
-        assert f"found run {run_id}, process {other.pid}, since" in answer.err
+        assert (answer.code, answer.err.count("\n"), said in answer.err) == (1, 1, True), answer.err
         deleted = DeletedDetection(camera="cam01", frame=5, detection=0)
         correct(store, open_match(store, TINY), [deleted], who="Ada", why="a shadow")
         answer = worldpose("reprocess", TINY, "--project", project_copy)
         assert (answer.code, answer.out.count(f"{TINY}: at work")) == (0, 1)
-        assert f"found run {run_id}, process {other.pid}, since" in " ".join(answer.out.split())
+        assert said in " ".join(answer.out.split())
         # A later run ended meanwhile, as two could once begin together.
         later = store.run(TINY).model_copy(update={"run_id": store.reserve_run(TINY)})
         store.finish_run(later)
@@ -198,33 +196,26 @@ def test_pages_read_what_the_command_line_prints(clock, monkeypatch):
 BEGUN = datetime(2026, 5, 1, 12, tzinfo=UTC)
 
 
-class Told:
-    """A store of one run: unit to end time since the run's start, and duration [s]."""
+UNITS = {
+    "ingest/a": (12.0, 2.0),
+    "ingest/b": (13.0, 2.0),
+    "tracking/c1": (20.0, 5.0),
+    "tracking/c2": (20.0, 4.0),
+}
+"""End time since the run's start, and duration [s]."""
 
-    units = {
-        "ingest/a": (12.0, 2.0),
-        "ingest/b": (13.0, 2.0),
-        "tracking/c1": (20.0, 5.0),
-        "tracking/c2": (20.0, 4.0),
-    }
+
+class Told:
+    """A store of one run of these units."""
 
     def run(self, match, run):
-        results = dict.fromkeys(self.units, "key")
-        executed = tuple(self.units)
-        return SimpleNamespace(
-            match_id=match,
-            run_id=run,
-            seconds=22.0,
-            started_at=BEGUN,
-            executed=executed,
-            results=results,
-        )
+        about = {"match_id": match, "run_id": run, "seconds": 22.0, "started_at": BEGUN}
+        return SimpleNamespace(**about, executed=tuple(UNITS), results=dict.fromkeys(UNITS, "key"))
 
     def manifest(self, match, stage, unit, key):
-        end, seconds = self.units[f"{stage}/{unit}"]
-        files = (SimpleNamespace(size=700), SimpleNamespace(size=50))
+        end, seconds = UNITS[f"{stage}/{unit}"]
         at = BEGUN + timedelta(seconds=end)
-        return SimpleNamespace(created_at=at, seconds=seconds, files=files)
+        return SimpleNamespace(created_at=at, seconds=seconds, files=(SimpleNamespace(size=50),))
 
 
 def test_what_elapsed_counts_units_side_by_side_once():
@@ -247,7 +238,7 @@ def test_a_number_is_for_every_stage_and_one_with_a_name_for_that():
     assert parse_time_limits(["ingest=0.5"]) == {"ingest": 0.5}
 
 
-@pytest.mark.parametrize("text", ["0", "-3", "inf", "nan", "soon", "tracks=3", "=3", "tracking="])
+@pytest.mark.parametrize("text", ["-3", "nan", "soon", "tracks=3", "=3", "tracking="])
 def test_what_is_no_limit_is_refused(text):
     with pytest.raises(UsageError, match="--time-limit"):
         parse_time_limits([text])
@@ -265,8 +256,6 @@ def test_what_is_no_limit_is_refused(text):
 def test_a_schedule_that_cannot_be_is_refused_before_anything_starts(text, said):
     with pytest.raises(UsageError, match=re.escape(said)):
         parse_schedules([text])
-    with pytest.raises(UsageError, match="twice"):
-        parse_schedules(["reprocess=0 3 * * * UTC", "reprocess=0 4 * * * UTC"])
 
 
 def test_a_schedule_without_a_zone_has_that_of_the_machine_or_is_refused(tmp_path, monkeypatch):
@@ -282,8 +271,6 @@ def test_a_schedule_without_a_zone_has_that_of_the_machine_or_is_refused(tmp_pat
         return parse_schedules(["reprocess=0 3 * * *"])["reprocess"].timezone
 
     assert zone() == "UTC"  # a slim image
-    shutil.copy(zones.parent / "UTC", local)
-    assert zone() == "UTC"
     shutil.copy(zones / "Berlin", local)
     for wrong in (None, "Etc/UTC\n", "no zone\n"):
         if wrong:
@@ -298,41 +285,33 @@ def test_a_schedule_without_a_zone_has_that_of_the_machine_or_is_refused(tmp_pat
     assert zone() == os.path.realpath(zones / "Lisbon").partition("zoneinfo/")[2]
 
 
-@pytest.fixture
-def collector(webhook):
-    """A server that takes OTLP over HTTP, and the spans that it got."""
+@pytest.mark.slow
+def test_spans_of_prefect_and_of_units_are_one_trace(webhook, tiny, tmp_path):
     pytest.importorskip("opentelemetry.sdk")
     service = pytest.importorskip("opentelemetry.proto.collector.trace.v1.trace_service_pb2")
-
-    def spans():
-        for _, body in webhook.posted:
-            for resource in service.ExportTraceServiceRequest.FromString(body).resource_spans:
-                for scope in resource.scope_spans:
-                    yield from ((scope.scope.name, span) for span in scope.spans)
-
-    return webhook.base, spans
-
-
-@pytest.mark.slow
-def test_spans_of_prefect_and_of_units_are_one_trace(collector, tiny, tmp_path):
-    base, spans = collector
-    asked = {"OTEL_EXPORTER_OTLP_ENDPOINT": base, "OTEL_SERVICE_NAME": "lab"}
+    asked = {"OTEL_EXPORTER_OTLP_ENDPOINT": webhook.base, "OTEL_SERVICE_NAME": "lab"}
     succeed("run", tiny, "--project", tmp_path / "project", environment=asked)
-    found = list(spans())
+    found = [
+        (scope.scope.name, span)
+        for _, body in webhook.posted
+        for resource in service.ExportTraceServiceRequest.FromString(body).resource_spans
+        for scope in resource.scope_spans
+        for span in scope.spans
+    ]
     record = Store.open(str(tmp_path / "project")).run(TINY)
     assert len({span.trace_id for _, span in found}) == 1
     own = {span.name: span for scope, span in found if scope == "worldpose"}
-    prefect = {span.name: span for scope, span in found if scope == "prefect"}
+    prefect = [span for scope, span in found if scope == "prefect"]
     units = {name for name in own if not name.startswith("stage ")}
     assert units == set(record.executed)
-    (flow,) = [span for span in prefect.values() if not span.parent_span_id]
+    (flow,) = [span for span in prefect if not span.parent_span_id]
     for unit in units:
         stage = own[f"stage {unit.partition('/')[0]}"]
         assert own[unit].parent_span_id == stage.span_id
         assert stage.parent_span_id == flow.span_id
         assert flow.start_time_unix_nano <= own[unit].start_time_unix_nano
         assert own[unit].end_time_unix_nano <= flow.end_time_unix_nano
-    tasks = [span for span in prefect.values() if span is not flow]
+    tasks = [span for span in prefect if span is not flow]
     assert len(tasks) == len(units)
     assert {span.parent_span_id for span in tasks} == {flow.span_id}
 

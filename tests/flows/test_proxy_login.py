@@ -6,17 +6,12 @@ import httpx
 import page_client
 import pytest
 from command_line import TINY
-from page_client import HERE, MATCH, TOKEN, a_click, moved
+from page_client import HERE, MATCH, TOKEN, TestClient, moved
 
 from flows.web.access import access_for
 from flows.web.app import create_app
 from worldpose.errors import UsageError
 from worldpose.review.journal import read_journal
-from worldpose.store.store import Store
-
-with page_client.warnings.catch_warnings():
-    page_client.warnings.simplefilter("ignore")
-    from fastapi.testclient import TestClient
 
 SECRET = "a secret of the proxy"
 FILE = f"""
@@ -44,11 +39,10 @@ def write_file(folder, text=FILE):
 
 
 @pytest.fixture
-def pages(project_copy, tmp_path):
-    access = access_for(
-        "127.0.0.1", token=TOKEN, names=(), secure=False, users=write_file(tmp_path)
-    )
-    return create_app(str(project_copy), access)
+def pages(store, tmp_path):
+    users = write_file(tmp_path)
+    access = access_for("127.0.0.1", token=TOKEN, names=(), secure=False, users=users)
+    return create_app(store.url, access)
 
 
 def client(app, address="10.1.2.3"):
@@ -60,7 +54,7 @@ def named(who, groups=None, secret=SECRET):
     return {**headers, "X-Proxy-Secret": secret} if secret else headers
 
 
-def test_the_proxy_tells_person_and_role(pages, project_copy):
+def test_the_proxy_tells_person_and_role(pages, store):
     dora = client(pages)
     opened = dora.get("/", headers=named("Dora"))
     assert opened.status_code == 200 and "HttpOnly" in opened.headers["set-cookie"]
@@ -69,29 +63,18 @@ def test_the_proxy_tells_person_and_role(pages, project_copy):
     assert "set-cookie" not in session.headers
     assert (session.json()["who"], session.json()["role"]) == ("Dora", "approver")
     secret = {"x-form-secret": session.json()["form_secret"]}
-    name, was = a_click(As(dora, "Dora"))
-    edit = moved(name, was, [was[0] + 1.0, was[1]])
-    answer = dora.post(f"{MATCH}/corrections", json=edit, headers={**named("Dora"), **secret})
-    assert answer.status_code == 200
-    *_, last = read_journal(Store.open(str(project_copy)), TINY).records
+    points = dora.get(f"{MATCH}/pictures/cam03", headers=named("Dora")).json()["points"]
+    name, (x, y) = min(points.items())
+    edit, path = moved(name, [x, y], [x + 1.0, y]), f"{MATCH}/corrections"
+    assert dora.post(path, json=edit, headers={**named("Dora"), **secret}).status_code == 200
+    *_, last = read_journal(store, TINY).records
     assert last.who == "Dora"
     # A group that was taken away counts from the next request on.
-    less = {**named("Dora", "staff"), **secret}
-    refused = dora.post(f"{MATCH}/corrections", json=edit, headers=less)
+    refused = dora.post(path, json=edit, headers={**named("Dora", "staff"), **secret})
     assert refused.status_code == 403 and "viewer" in refused.json()["error"]
     assert dora.get("/login", headers=named("Dora"), follow_redirects=False).status_code == 303
     left = dora.post("/api/logout", json={}, headers={**named("Dora"), **secret})
     assert left.json() == {"next": "/oauth2/sign_out"}
-
-
-class As:
-    """A browser behind the proxy."""
-
-    def __init__(self, browser, who):
-        self.browser, self.who = browser, who
-
-    def get(self, path):
-        return self.browser.get(path, headers=named(self.who))
 
 
 def test_roles_are_the_highest_of_the_groups(pages):
@@ -168,13 +151,8 @@ def test_a_bad_table_of_the_proxy_is_refused(old, new, problem, tmp_path):
 
 def test_another_address_named_by_a_client_does_not_allow_more_guesses(project_copy, tmp_path):
     with page_client.serving(project_copy, tmp_path) as base:
-        wrong = {"who": "Eve", "token": TOKEN + "x"}
-        begun = time.monotonic()
-        codes = [
-            httpx.post(
-                f"{base}/api/login", json=wrong, headers={"X-Forwarded-For": f"10.0.0.{number}"}
-            ).status_code
-            for number in range(8)
-        ]
+        wrong, begun = {"who": "Eve", "token": TOKEN + "x"}, time.monotonic()
+        claims = [{"X-Forwarded-For": f"10.0.0.{number}"} for number in range(8)]
+        answers = [httpx.post(f"{base}/api/login", json=wrong, headers=each) for each in claims]
         assert time.monotonic() - begun < 10.0, "too slow to tell"
-        assert codes == [401] * 5 + [429] * 3
+        assert [answer.status_code for answer in answers] == [401] * 5 + [429] * 3

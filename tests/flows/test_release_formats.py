@@ -93,23 +93,16 @@ def write(form, run, out):
     return list(EXPORTS[form](run, out))
 
 
-def test_labels_are_where_people_are_at_the_moments_of_the_images(match_folder, tmp_path):
-    moving = bodies()
-    moving["transl"][:, :, 0] += 0.1 * np.arange(4)[:, None]
-    run = origin(match_folder, body_fitting__A_1=moving, broadcast_calibration__A_1=broadcast())
-    places = {}
-    for late in (0.0, 0.4):
-        clip = run.spec.clips[0].model_copy(update={"broadcast_offset_frames": 1.0 - late})
-        spec = run.spec.model_copy(update={"clips": (clip,)})
-        shifted = replace(run, registration=SimpleNamespace(spec=spec))
-        (results,) = write("alphapose", shifted, tmp_path / str(late))
-        entries = json.loads(results.read_text())
-        assert [each["image_id"] for each in entries if each["idx"] == 3] == [
-            f"{n}.jpg" for n in (1, 2, 3)
-        ]
-        places[late] = np.array([each["keypoints"][::3] for each in entries])
-    # 0.4 of a step of 0.1 m, at 4000 px and 70 m.
-    np.testing.assert_allclose(places[0.4] - places[0.0], 0.4 * 0.1 * 4000 / 70, rtol=0.02)
+def restated(run, **spec):
+    """The run with other entries of match.yaml."""
+    about = SimpleNamespace(spec=run.spec.model_copy(update=spec), folder=run.registration.folder)
+    return replace(run, registration=about)
+
+
+@pytest.fixture
+def filmed(match_folder):
+    """A run with bodies and the broadcast camera alone."""
+    return origin(match_folder, body_fitting__A_1=bodies(), broadcast_calibration__A_1=broadcast())
 
 
 def test_a_camera_of_another_frame_rate_is_left_out_where_others_are_written(
@@ -118,11 +111,9 @@ def test_a_camera_of_another_frame_rate_is_left_out_where_others_are_written(
     known = {f"broadcast_calibration__{name}": broadcast() for name in ("A_1", "B_1")}
     known["broadcast_calibration__B_1"].attrs["clip_id"] = "B_1"
     run = origin(match_folder, **known)
-    clips_ = [run.spec.clips[0]]
-    clips_.append(clips_[0].model_copy(update={"id": "B_1", "broadcast": "half"}))
+    second = run.spec.clips[0].model_copy(update={"id": "B_1", "broadcast": "half"})
     half = run.spec.cameras[1].model_copy(update={"id": "half", "fps": 25.0})
-    update = {"clips": tuple(clips_), "cameras": (*run.spec.cameras, half)}
-    run.registration.spec = run.spec.model_copy(update=update)
+    run = restated(run, clips=(*run.spec.clips, second), cameras=(*run.spec.cameras, half))
     export(run, ["worldpose"], tmp_path / "out")
     assert [path.name for path in (tmp_path / "out/cameras").iterdir()] == ["A_1.npz"]
     assert "left out: view B_1" in caplog.text
@@ -151,14 +142,13 @@ def test_scenes_have_the_lens_of_every_frame_of_a_zoom(match_folder, tmp_path):
     assert [lens.Get(frame)[0] for frame in lens.GetTimeSamples()] == [-0.02, -0.08, -0.15]
 
 
-def test_alphapose_results_are_the_projected_bodies(match_folder, tmp_path):
-    run = origin(match_folder, body_fitting__A_1=bodies(), broadcast_calibration__A_1=broadcast())
-    (results,) = write("alphapose", run, tmp_path)
+def test_alphapose_results_are_the_projected_bodies(filmed, tmp_path):
+    (results,) = write("alphapose", filmed, tmp_path)
     entries = json.loads(results.read_text())
     # The second person is missing in the third frame, and the camera in the last.
     shown = [("0.jpg", 3), ("0.jpg", 8), ("1.jpg", 3), ("1.jpg", 8), ("2.jpg", 3)]
     assert [(each["image_id"], each["idx"]) for each in entries] == shown
-    model, poses, *_ = best_results.fitted_bodies(run.run, "A_1")
+    model, poses, *_ = best_results.fitted_bodies(filmed.run, "A_1")
     world = fold_keypoints(model, HALPE26)(poses)[0, 0]
     # From 70 m in front of the centre spot and 2 m up, with 4000 px.
     across = 960.0 + 4000.0 * world[:, 0] / (world[:, 1] + 70.0)
@@ -170,73 +160,58 @@ def test_alphapose_results_are_the_projected_bodies(match_folder, tmp_path):
 
 
 @pytest.mark.parametrize("form", ["challenge", "challenge-2025"])
-def test_the_challenge_is_written_from_bodies_and_the_broadcast_camera(
-    match_folder, tmp_path, form
-):
-    run = origin(match_folder, body_fitting__A_1=bodies(), broadcast_calibration__A_1=broadcast())
+def test_the_challenge_is_written_from_bodies_and_the_broadcast_camera(filmed, tmp_path, form):
     out = tmp_path / "out"
-    written = {path.relative_to(out).as_posix() for path in write(form, run, out)}
+    written = {path.relative_to(out).as_posix() for path in write(form, filmed, out)}
     kinds = ("boxes", "skel_2d", "skel_3d")
     files = {f"{k}.npz" for k in kinds} if "2025" in form else {f"{k}/A_1.npy" for k in kinds}
     assert written == files | {"cameras/A_1.npz", "pitch_points.txt", "submission.zip"}
-    clip = read_challenge(out)["A_1"]
-    there = np.isfinite(clip.boxes).all(-1)
+    there = np.isfinite(read_challenge(out)["A_1"].boxes).all(-1)
     # The second person is lost in frame 102, the camera in frame 103.
-    np.testing.assert_array_equal(
-        there, [[True, True], [True, True], [True, False], [False, False]]
-    )
-    poses = BodyParameters(
-        np.zeros(10), [np.pi / 2, 0.0, 0.0], np.zeros(69), np.array([2.0, 0.0, 1.1])
-    )
-    joints = fold_keypoints(load_open_body(), CHALLENGE15)(poses)
-    # Single precision.
-    np.testing.assert_allclose(
-        read_submission(out / "submission.zip")["A_1"][1, 0], joints, atol=1e-6
-    )
+    assert there.tolist() == [[True, True], [True, True], [True, False], [False, False]]
+    place = ([np.pi / 2, 0.0, 0.0], np.zeros(69), np.array([2.0, 0.0, 1.1]))
+    joints = fold_keypoints(load_open_body(), CHALLENGE15)(BodyParameters(np.zeros(10), *place))
+    found = read_submission(out / "submission.zip")["A_1"][1, 0]
+    np.testing.assert_allclose(found, joints, atol=1e-6)  # single precision
     points = np.loadtxt(out / "pitch_points.txt")
     assert (np.abs(points).max(0) == [52.5, 34.0, 0.2]).all()
 
 
-def test_the_broadcast_camera_joins_the_release_layout_where_there_is_one(match_folder, tmp_path):
-    run = origin(match_folder, body_fitting__A_1=bodies(), broadcast_calibration__A_1=broadcast())
-    write("worldpose", run, tmp_path / "out")
+def test_the_broadcast_camera_joins_the_release_layout_where_there_is_one(filmed, tmp_path):
+    write("worldpose", filmed, tmp_path / "out")
     poses, model = read_poses(tmp_path / "out" / "poses" / "A_1.npz")
     assert (poses.batch_shape, model) == ((2, 4), "open-neutral/2")
     camera = read_camera(tmp_path / "out" / "cameras" / "A_1.npz")
     np.testing.assert_array_equal(np.isnan(camera.focal[:, 0]), [False, False, False, True])
 
 
-def test_other_methods_get_our_boxes_as_mot_lines(match_folder, tmp_path, caplog):
-    run = origin(match_folder, body_fitting__A_1=bodies(), broadcast_calibration__A_1=broadcast())
-    written = write("tracks", run, tmp_path / "out")
+def test_other_methods_get_our_boxes_as_mot_lines(filmed, match_folder, tmp_path, caplog):
+    written = write("tracks", filmed, tmp_path / "out")
     assert [path.name for path in written] == ["baseline_settings.json", "A_1.txt"]
     rows = np.loadtxt(written[1], delimiter=",")
     # The second person is lost in the third image, the camera in the fourth.
     assert rows[:, :2].tolist() == [[1, 4], [1, 9], [2, 4], [2, 9], [3, 4]]
-    write("challenge", run, tmp_path / "challenge")
-    boxes = read_challenge(tmp_path / "challenge")["A_1"].boxes
-    x0, y0, x1, y1 = boxes[0, 1]
+    write("challenge", filmed, tmp_path / "challenge")
+    x0, y0, x1, y1 = read_challenge(tmp_path / "challenge")["A_1"].boxes[0, 1]
     # Pixels count from 1, at corners, there; texts hold hundredths.
     assert rows[1, 2:6] == pytest.approx([x0 + 1.5, y0 + 1.5, x1 - x0, y1 - y0], abs=0.006)
-    clip = run.spec.clips[0].model_copy(update={"broadcast_offset_frames": 12})
-    spec = run.spec.model_copy(update={"clips": (clip,)})
-    run = replace(run, registration=SimpleNamespace(spec=spec))
+    settings = BaselineSettings.model_validate_json(written[0].read_bytes())
+    assert (settings.slahmr_max_num_tracks, settings.slahmr_chunk_frames) == (30, 100)
+    clip = filmed.spec.clips[0].model_copy(update={"broadcast_offset_frames": 12})
+    run = restated(filmed, clips=(clip,))
     later = np.loadtxt(write("tracks", run, tmp_path / "later")[1], delimiter=",")
     assert later[:, 0].tolist() == [13, 13, 14, 14, 15]
-    cameras = tuple(each.model_copy(update={"fps": 25.0}) for each in spec.cameras)
-    spec = spec.model_copy(update={"cameras": cameras})
-    run = replace(run, registration=SimpleNamespace(spec=spec))
+    cameras = tuple(each.model_copy(update={"fps": 25.0}) for each in run.spec.cameras)
+    run, slower = restated(run, cameras=cameras), "found 25 images per second, and 50 frames"
     for form in ("tracks", "challenge", "slahmr-cameras"):
-        with pytest.raises(InputError, match="found 25 images per second, and 50 frames"):
+        with pytest.raises(InputError, match=slower):
             write(form, run, tmp_path / "slower")
     with_joints = replace(run, run=origin(match_folder, **tracked()).run)
-    with pytest.raises(InputError, match="found 25 images per second, and 50 frames"):
+    with pytest.raises(InputError, match=slower):
         _write_clip(with_joints, "A_1", "m_A_1", "train", tmp_path / "released", "none", ({}, {}))
     names = [path.name for path in write("worldpose", run, tmp_path / "slower")]
     assert names == ["A_1.npz", "A_1.json"]
     assert not (tmp_path / "slower" / "cameras").exists() and "view A_1" in caplog.text
-    settings = BaselineSettings.model_validate_json(written[0].read_bytes())
-    assert (settings.slahmr_max_num_tracks, settings.slahmr_chunk_frames) == (30, 100)
 
 
 def tracked():
@@ -271,37 +246,33 @@ def tracked():
 def test_files_for_tools_say_what_they_hold(match_folder, tmp_path, monkeypatch):
     monkeypatch.setattr(best_results, "names_of", lambda run, clip: {8: "walker"})
     run = replace(origin(match_folder, **tracked()), licence="For tests alone.")
-    files = {form: write(form, run, tmp_path) for form in ("c3d", "csv", "mot", "gltf")}
-    names = {path.relative_to(tmp_path).as_posix() for found in files.values() for path in found}
-    assert names == {
+    files = [path for form in ("c3d", "csv", "mot", "gltf") for path in write(form, run, tmp_path)]
+    tables = ("joints", "people", "strides")
+    assert {path.relative_to(tmp_path).as_posix() for path in files} == {
         *(f"markers/A_1/person_00{person}.c3d" for person in (3, 8)),
-        *(f"tables/A_1.{table}.csv" for table in ("joints", "people", "strides")),
-        *(f"tables/A_1.{table}.csv-metadata.json" for table in ("joints", "people", "strides")),
-        "opensim/A_1/person_003_frame_000100.mot",
-        "opensim/A_1/person_008_frame_000100.mot",
-        "opensim/A_1/person_008_frame_000103.mot",
-        "scenes/A_1.glb",
+        *(f"tables/A_1.{t}.{end}" for t in tables for end in ("csv", "csv-metadata.json")),
+        *(f"opensim/A_1/person_00{n}_frame_000100.mot" for n in (3, 8)),
+        *("opensim/A_1/person_008_frame_000103.mot", "scenes/A_1.glb"),
     }
-    texts = [
-        (tmp_path / "markers/A_1/person_008.c3d").read_bytes(),
-        (tmp_path / "tables/A_1.joints.csv-metadata.json").read_bytes(),
-        (tmp_path / "opensim/A_1/person_008_frame_000103.mot").read_bytes(),
-        (tmp_path / "scenes/A_1.glb").read_bytes(),
-    ]
-    for text in texts:
-        assert b"For tests alone." in text
-        assert b"usable" in text
-        assert b"open-neutral/2 (CC0 1.0)" in text
-    assert b"mixed" in texts[0] and b"mixed" in texts[2] and b'"kind":"mixed"' in texts[3]
-    assert b"COCO-17 keypoints of the fitted body open-neutral/2" in texts[1]
-    assert b"two contacts of a foot" in texts[1] and b"by their feet alone" in texts[1]
-    assert b"walker" in texts[0] and b"walker" in texts[2] and b'"name":"walker"' in texts[3]
-    assert b"person_8" not in texts[0]
+    c3d, about, mot, glb = (
+        (tmp_path / name).read_bytes()
+        for name in (
+            *("markers/A_1/person_008.c3d", "tables/A_1.joints.csv-metadata.json"),
+            *("opensim/A_1/person_008_frame_000103.mot", "scenes/A_1.glb"),
+        )
+    )
+    for text in (c3d, about, mot, glb):
+        for said in (b"For tests alone.", b"usable", b"open-neutral/2 (CC0 1.0)"):
+            assert said in text
+    assert b"mixed" in c3d and b"mixed" in mot and b'"kind":"mixed"' in glb
+    assert b"COCO-17 keypoints of the fitted body open-neutral/2" in about
+    assert b"two contacts of a foot" in about and b"by their feet alone" in about
+    assert b"walker" in c3d and b"walker" in mot and b'"name":"walker"' in glb
+    assert b"person_8" not in c3d
     rows = (tmp_path / "tables/A_1.joints.csv").read_text().splitlines()
     assert rows[0].startswith("frame,time_s,person,name,kind,")
     assert {row.split(",")[3] for row in rows[1:] if ",8," in row[:20]} == {"walker"}
-    unstated = replace(run, licence=None)
-    write("c3d", unstated, tmp_path / "unstated")
+    write("c3d", replace(run, licence=None), tmp_path / "unstated")
     assert b"not stated" in (tmp_path / "unstated/markers/A_1/person_003.c3d").read_bytes()
 
 
@@ -334,18 +305,13 @@ def test_heels_and_toes_without_a_body_are_those_of_triangulation(match_folder):
 def test_a_match_changes_no_frame_rate_of_another_matchs_files(match_folder, tmp_path):
     run, out = origin(match_folder, **tracked()), tmp_path / "out"
     rates = out / "frame_rates.json"
-
-    def other(**stated):
-        spec = run.spec.model_copy(update=stated)
-        return replace(run, registration=SimpleNamespace(spec=spec, folder=str(match_folder)))
-
     export(run, ["joints"], out)
-    export(other(fps=25.0), ["joints"], out)  # corrected
+    export(restated(run, fps=25.0), ["joints"], out)  # corrected
     assert json.loads(rates.read_text()) == {"A_1": 25.0}
     with pytest.raises(InputError, match=r"A_1: expected 50.0, or no .* found 25.0, of m\."):
-        export(other(match_id="other"), ["worldpose"], out)
+        export(restated(run, match_id="other"), ["worldpose"], out)
     assert not (out / "poses").exists() and json.loads(rates.read_text()) == {"A_1": 25.0}
-    export(other(match_id="other", fps=25.0), ["worldpose"], out)  # of both
+    export(restated(run, match_id="other", fps=25.0), ["worldpose"], out)  # of both
     with pytest.raises(InputError, match=r"found 25.0, of m and other\."):
         export(run, ["joints"], out)
     export(run, ["joints"], out, overwrite=True)
@@ -362,9 +328,7 @@ def test_matches_in_one_folder_state_the_lens_of_each_camera(match_folder, tmp_p
             dims = [f"{name}{d}" for d in range(np.ndim(value))]
             rig[name] = (("camera", *dims), np.array(value)[None])
         run = origin(match_folder, **tracked(), bundle_adjustment__cameras=rig)
-        spec = run.spec.model_copy(update={"match_id": match})
-        about = SimpleNamespace(spec=spec, folder=str(match_folder))
-        export(replace(run, registration=about), ["worldpose"], tmp_path / "out")
+        export(restated(run, match_id=match), ["worldpose"], tmp_path / "out")
         return json.loads((tmp_path / "out" / "lens_errors.json").read_text())
 
     assert export_rig("m", "north", LensModel.FISHEYE).keys() == {"north"}
@@ -402,23 +366,18 @@ def test_a_surface_with_terms_of_its_own_is_written_on_request_with_them(
     assert b'"skins"' in path.read_bytes() and b"Terms of the model." in path.read_bytes()
 
 
-def test_slahmr_gets_true_cameras_over_a_ground_with_y_down(match_folder, tmp_path):
-    results = {"body_fitting__A_1": bodies(), "broadcast_calibration__A_1": broadcast()}
+def test_slahmr_gets_true_cameras_over_a_ground_with_y_down(filmed, tmp_path):
     with pytest.raises(InputError, match="none in 1 of 4, the first 3"):
-        write("slahmr-cameras", origin(match_folder, **results), tmp_path / "gap")
-    results["body_fitting__A_1"] = bodies().isel(frame=slice(0, 3))
-    path = write("slahmr-cameras", origin(match_folder, **results), tmp_path / "out")[1]
+        write("slahmr-cameras", filmed, tmp_path / "gap")
+    filmed.run.results["body_fitting/A_1"] = bodies().isel(frame=slice(0, 3))
+    path = write("slahmr-cameras", filmed, tmp_path / "out")[1]
     assert path.relative_to(tmp_path).as_posix() == "out/slahmr/cameras/A_1/shot-0/cameras.npz"
     with np.load(path) as found:
         w2c, (fx, fy, cx, cy) = found["w2c"][0], found["intrins"][0]
-        assert (int(found["width"]), int(found["height"]), float(found["focal"])) == (
-            1920,
-            1080,
-            4000.0,
-        )
+        about = int(found["width"]), int(found["height"]), float(found["focal"])
+    assert about == (1920, 1080, 4000.0)
     # A head 1.8 m above a spot 3 m to the right and 5 m beyond the centre, y down there.
     x, y, z, _ = w2c @ [3.0, -1.8, 5.0, 1.0]
     # The camera stands at (0, -70, 2), looks along y.
-    assert (fx * x / z + cx, fy * y / z + cy) == pytest.approx(
-        (960 + 4000 * 3 / 75, 540 + 4000 * 0.2 / 75), abs=1e-9
-    )
+    expected = (960 + 4000 * 3 / 75, 540 + 4000 * 0.2 / 75)
+    assert (fx * x / z + cx, fy * y / z + cy) == pytest.approx(expected, abs=1e-9)

@@ -1,7 +1,7 @@
 """Stale results of an edit, by match, found without a run."""
 
 import json
-from contextlib import contextmanager
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import pytest
@@ -10,7 +10,7 @@ from test_iteration import halves
 
 from data_contracts.review import DeletedDetection, MergedTracks, MovedPoint
 from data_contracts.run import UnitFailure
-from flows import reprocess, run_plan
+from flows import reprocess
 from flows.cli.run import exit_code
 from flows.layers import PROJECT, write_layer
 from flows.method import METHOD
@@ -69,18 +69,6 @@ def test_an_edit_makes_what_was_made_from_it_stale_and_nothing_else(store, edit)
     assert {unit.planned.name for unit in found.units} == expected
     assert len(found.to_compute) == len(expected)
     assert {unit.planned.name for unit in found.units if unit.own_reasons} == set(starts)
-
-
-def test_new_code_makes_what_is_computed_with_it_stale(store, monkeypatch):
-    real = run_plan.code_version
-
-    def newer(module):
-        return real(module) | ({"worldpose.filtering.judging": "new"} if "filter" in module else {})
-
-    monkeypatch.setattr(run_plan, "code_version", newer)
-    (unit,) = run_status(store, TINY).units
-    assert (unit.planned.name, unit.state) == ("filtering/clip", "stale")
-    assert any("worldpose.filtering.judging" in str(reason) for reason in unit.own_reasons)
 
 
 def finish(store, **changes):
@@ -152,43 +140,34 @@ def test_a_result_that_holds_a_withdrawn_edit_is_not_taken_for_one_without_it():
 
 def test_a_match_that_fails_stops_no_other(store, tiny, tmp_path, monkeypatch):
     edit_box(store)
-    folder = halves(tiny, tmp_path / "other")
-    register(store, folder)
-    ran = []
+    register(store, halves(tiny, tmp_path / "other"))
+    ran, real = [], reprocess.read_summary
 
     def run(store, match, request):
         ran.append((match.match_id, request.gates, request.workers))
         return store.run(match.match_id)
-
-    @contextmanager
-    def machines(store, request):
-        yield lambda missing: request
-
-    monkeypatch.setattr(reprocess, "run_match", run)
-    monkeypatch.setattr(reprocess, "shared_machines", machines)
-    real = reprocess.read_summary
 
     def broken(store, match_id):
         if match_id == "halves":
             raise OSError("its folder is gone")
         return real(store, match_id)
 
-    request = RunRequest({}, workers=3)
-    first = list(reprocess_matches(store, (), request))
-    assert [(each.match_id, each.state) for each in first] == [
-        ("halves", "never run"),
-        (TINY, "complete"),
-    ]
+    def states(which=(), **how):
+        found = reprocess_matches(store, which, RunRequest({}, workers=3), **how)
+        return [(each.match_id, each.state, each.problem) for each in found]
+
+    def machines(store, request):
+        return nullcontext(lambda missing: request)
+
+    monkeypatch.setattr(reprocess, "run_match", run)
+    monkeypatch.setattr(reprocess, "shared_machines", machines)
+    assert states() == [("halves", "never run", None), (TINY, "complete", None)]
     assert ran == [(TINY, "never", 3)]
     monkeypatch.setattr(reprocess, "read_summary", broken)
-    second = list(reprocess_matches(store, (), request))
-    assert [(each.state, each.problem) for each in second] == [
-        ("failed", "its folder is gone"),
-        ("complete", None),
-    ]
-    assert exit_code({each.state for each in second}) == 4
-    rehearsed = list(reprocess_matches(store, (TINY,), request, is_rehearsal=True))
-    assert [each.state for each in rehearsed] == ["stale"]
+    found = states()
+    assert found == [("halves", "failed", "its folder is gone"), (TINY, "complete", None)]
+    assert exit_code({state for _, state, _ in found}) == 4
+    assert states((TINY,), is_rehearsal=True)[0][1] == "stale"
     assert len(ran) == 2
 
 
@@ -212,15 +191,8 @@ def test_the_deployment_starts_a_run_of_each_stale_match_in_the_background(store
     edit_box(store)
     write_layer(store, PROJECT, {"tracking.gate_m": 0.5, "gates": "always"})
     assert deployed.reprocess.fn(store.url) == {TINY: "started"}
-    ((match_id, given),) = runs.started
-    assert match_id == TINY
-    assert given == {
-        "priority": "background",
-        "settings": None,
-        "until_stage": None,
-        "gates": "always",
-        "time_limits": None,
-    }
+    nothing = dict.fromkeys(("settings", "until_stage", "time_limits"))
+    assert runs.started == [(TINY, {"priority": "background", "gates": "always", **nothing})]
     runs.at_work = (TINY,)
     assert deployed.reprocess.fn(store.url) == {TINY: "has a run"}
     assert len(runs.started) == 1
@@ -230,13 +202,14 @@ def test_the_deployment_starts_a_run_of_each_stale_match_in_the_background(store
 
 
 def test_the_exit_code_says_how_far_it_came():
-    def code(*states):
-        return exit_code(set(states))
-
-    assert code() == code("current", "never run", "stale", "complete") == 0
-    assert code("failed") == 1
-    assert code("failed", "current") == code("partial") == 4
-    assert code("waiting", "complete") == 3
+    for states, code in (
+        (("current", "never run", "stale", "complete"), 0),
+        (("failed",), 1),
+        (("waiting", "complete"), 3),
+        (("failed", "current"), 4),
+        (("partial",), 4),
+    ):
+        assert exit_code(set(states)) == code
 
 
 def test_the_command_lists_what_it_would_compute_and_why(store):

@@ -16,7 +16,7 @@ from command_line import TINY, invoke
 from flows import layers, reprocess
 from flows.cli import run as run_command
 from flows.cli import settings as cli_settings
-from flows.layers import known_pitch, project_layers, read_layer, write_layer
+from flows.layers import project_layers, read_layer, write_layer
 from flows.progress import reporting_to
 from flows.registering import open_match, register
 from flows.reports.match_pictures import shown_pitch
@@ -68,15 +68,11 @@ def keys_of_run(store, monkeypatch):
         raise CapturedError
 
     found_folder = ""
-    for place, name in (
-        (run_command, "iterate_match"),
-        (run_command, "run_match"),
-        (reprocess, "iterate_match"),
-        (reprocess, "run_match"),
-        (deployed, "_iterate_until_decided"),
-        (deployed, "_run_until_decided"),
-    ):
-        monkeypatch.setattr(place, name, capture)
+    for place in (run_command, reprocess):
+        monkeypatch.setattr(place, "iterate_match", capture)
+        monkeypatch.setattr(place, "run_match", capture)
+    monkeypatch.setattr(deployed, "_iterate_until_decided", capture)
+    monkeypatch.setattr(deployed, "_run_until_decided", capture)
 
     def take(door, folder):
         nonlocal found_folder
@@ -147,9 +143,8 @@ def test_every_door_computes_the_same_keys(store, smpl, tiny, keys_of_run, tmp_p
         shutil.copytree(tiny, inbox / "arrived")
         moved = store.registration(TINY).model_copy(update={"folder": str(tmp_path / "gone")})
         store.register(moved)  # it arrives as a match whose folder has moved
-        plan = ServePlan(
-            project=store.url, inbox=inbox, state=tmp_path, prefect="", settle_seconds=0.0
-        )
+        own = {"project": store.url, "inbox": inbox, "state": tmp_path}
+        plan = ServePlan(**own, prefect="", settle_seconds=0.0)
         for _ in range(2):
             deployed.ingest.fn(plan.model_dump(mode="json"))
         runs.run_all()
@@ -194,10 +189,8 @@ def test_each_value_is_from_the_last_layer_that_states_it(store, tiny):
     ("text", "key", "found"),
     [
         ("detection.strid: 2", "detection.strid", "Did you mean 'detection.stride'.*settings"),
-        ("detection.stride: none", "detection.stride", "'none'"),
         ("tracking.gate_m: -1", "tracking.gate_m", "-1"),
         ("iterations: many", "iterations", "many"),
-        ("iterations: 0", "iterations", "0"),
         ("body_folder: bodies", "body_folder", "relative path 'bodies'"),
         ("exports: [joints, docx]", "exports", "docx"),
         ("venue: hall", "venue", "project"),
@@ -214,32 +207,34 @@ def test_a_layer_that_is_wrong_is_refused_with_file_and_key(store, text, key, fo
     assert key in refused.value.where
 
 
-def test_match_yaml_names_its_venue_and_the_venue_gives_pitch_and_side(store, tiny, tmp_path):
-    folder = shutil.copytree(tiny, tmp_path / "at_parken")
+def without_pitch(tiny, folder, **changes):
+    """A copy of the match without pitch.json; its match.yaml before the changes."""
+    shutil.copytree(tiny, folder)
     (folder / "pitch.json").unlink()
     text = yaml.safe_load((folder / "match.yaml").read_text())
-    named = {"match_id": "final", "venue": "parken"}
-    (folder / "match.yaml").write_text(yaml.safe_dump({**text, **named}))
+    (folder / "match.yaml").write_text(yaml.safe_dump({**text, **changes}))
+    return text
+
+
+def test_match_yaml_names_its_venue_and_the_venue_gives_pitch_and_side(store, tiny, tmp_path):
+    text = without_pitch(tiny, tmp_path / "at_parken", match_id="final", venue="parken")
     camera = text["cameras"][0]["id"]
     venue = {"pitch": {"length": 101.0}, "sides": {camera: "near"}, "tracking.gate_m": 0.6}
     write_layer(store, "venues/parken", venue)
-    match, _ = register(store, folder)
-    assert match.folder.pitch.length == 101.0
+    match, _ = register(store, tmp_path / "at_parken")
+    assert match.folder.pitch.length == match.pitch_source["length"] == 101.0
     assert match.folder.spec.camera(camera).side == "near"
     assert resolve(match.layers).overrides == {"tracking": {"gate_m": 0.6}}
-    assert match.pitch_source["length"] == 101.0
 
 
 def test_clicks_have_the_names_of_the_venues_game(store, tiny, tmp_path):
-    folder = shutil.copytree(tiny, tmp_path / "hall")
-    (folder / "pitch.json").unlink()
-    text = yaml.safe_load((folder / "match.yaml").read_text())
-    named = {"match_id": "hall", "venue": "hall"}
-    (folder / "match.yaml").write_text(yaml.safe_dump({**text, **named}))
+    folder, copy = tmp_path / "hall", tmp_path / "copy"
+    text = without_pitch(tiny, folder, match_id="hall", venue="hall")
     places = ("backboard_left_near_top", "free_throw_left_center", "center_mark", "halfway_near")
     points = [{"name": name, "xy": [100.0, 100.0 + n]} for n, name in enumerate(places)]
     camera = next(each["id"] for each in text["cameras"] if each.get("kind") != "broadcast")
     shutil.rmtree(folder / "annotations")
+    shutil.copytree(folder, copy)
     file = folder / "annotations" / "static_calibration" / f"{camera}.json"
     file.parent.mkdir(parents=True)
     file.write_text(json.dumps({"contract": 1, "points": points}))
@@ -249,27 +244,24 @@ def test_clicks_have_the_names_of_the_venues_game(store, tiny, tmp_path):
         wrong = "a point of the futsal pitch in the settings of the venue hall"
         with nullcontext() if template == "basketball" else pytest.raises(InputError, match=wrong):
             register(store, folder, unfinished=True)
-    again = (folder / "again.json", tmp_path / "copy")
-    shutil.copytree(folder, again[1])
-    shutil.rmtree(again[1] / "annotations")
-    categories = [{"id": 1, "name": "p", "keypoints": [*places, places[0]]}]
     images = [{"id": 1, "file_name": f"{camera}.png", "width": 1920, "height": 1080}]
     numbers = [n for x in range(5) for n in (100 + x, 100, 2)]
-    clicks = [{"id": 1, "image_id": 1, "category_id": 1, "keypoints": numbers}]
-    coco = {"images": images, "categories": categories, "annotations": clicks}
-    again[0].write_text(json.dumps(coco))
-    given = ("import", "--clicks", again[0], "--out", again[1], "--project")
+    coco = {
+        "images": images,
+        "categories": [{"id": 1, "name": "p", "keypoints": [*places, places[0]]}],
+        "annotations": [{"id": 1, "image_id": 1, "category_id": 1, "keypoints": numbers}],
+    }
+    (folder / "again.json").write_text(json.dumps(coco))
+    given = ("import", "--clicks", folder / "again.json", "--out", copy, "--project")
     command(*given, tmp_path / "other", code=1)
     command(*given, store.url)
-    found = json.loads((again[1] / "pitch.json").read_text())
+    found = json.loads((copy / "pitch.json").read_text())
     assert found["template"] == "basketball" and [*found["points"]] == [f"{places[0]}.again"]
 
 
 def test_a_venue_that_the_clicks_do_not_fit_can_be_taken_back(store, tiny, tmp_path, ada):
-    folder = shutil.copytree(tiny, tmp_path / "m")
-    (folder / "pitch.json").unlink()
-    text = (folder / "match.yaml").read_text().replace(TINY, "other")
-    (folder / "match.yaml").write_text(text)
+    folder = tmp_path / "m"
+    without_pitch(tiny, folder, match_id="other")
     write_layer(store, "venues/hall", {"pitch": {"template": "futsal"}})
     for match in (folder, "other"):
         given = ("settings", match, "--project", store.url)
@@ -286,21 +278,8 @@ def test_a_venue_that_the_clicks_do_not_fit_can_be_taken_back(store, tiny, tmp_p
     register(store, folder, unfinished=True)
 
 
-def test_the_pitch_of_labels_is_that_of_the_venue_in_the_matchs_own_layer(store, tiny, tmp_path):
-    spec = read_match(tiny).spec.model_copy(update={"venue": "elsewhere"})
-    assert known_pitch(store, tmp_path, spec) is None
-    own, size = f"matches/{TINY}", {"pitch": {"length": 101.0}}
-    write_layer(store, "venues/parken", size)
-    for values in ({"venue": "parken"}, size):
-        write_layer(store, own, values)
-        assert known_pitch(store, tmp_path, spec).length == 101.0
-    write_layer(store, own, {"venue": "gone"})
-    assert known_pitch(store, tmp_path, spec) is None
-
-
 def test_the_list_has_one_short_line_per_setting_and_the_rest_by_name():
     lines = command("settings", "--list").splitlines()
-    assert max(map(len, lines)) <= 100
     assert any(line.startswith("  min_views = 2  ") for line in lines)
     assert command("run", "any", "--set", "list").splitlines() == lines
     about = command("settings", "--describe", "triangulation.min_views")
@@ -442,41 +421,41 @@ def test_a_value_that_no_run_can_use_is_not_kept(store, tmp_path):
     settle(store, open_match(store, TINY), RunRequest({"tracking": {"gate_m": 0.7}}))
 
 
-def test_of_two_saves_of_one_revision_one_is_refused(store, ada, bob, monkeypatch):
-    both, save = Barrier(2), page_settings.save_layer
+@pytest.fixture
+def at_once(monkeypatch):
+    """Runs a function for two arguments, whose saves by a module begin together."""
 
-    def save_late(*given):
-        with suppress(BrokenBarrierError):
-            both.wait(timeout=0.5)
-        save(*given)
+    def run(module, change, given):
+        both, save = Barrier(2), module.save_layer
 
-    monkeypatch.setattr(page_settings, "save_layer", save_late)
+        def save_late(*layer):
+            with suppress(BrokenBarrierError):
+                both.wait(timeout=0.5)
+            save(*layer)
 
-    def post(who, values):
-        sent = {"layer": "project", "revision": "", "values": values}
-        return who.post("/api/settings", json=sent).status_code
+        monkeypatch.setattr(module, "save_layer", save_late)
+        with ThreadPoolExecutor(2) as pool:
+            return list(pool.map(change, given))
 
-    with ThreadPoolExecutor(2) as pool:
-        codes = pool.map(post, (ada, bob), ({"iterations": 2}, {"gates": "auto"}))
-        assert sorted(codes) == [200, 409]
+    return run
 
 
-def test_two_commands_that_change_one_layer_both_count(store, monkeypatch):
-    both, save, opened = Barrier(2), cli_settings.save_layer, open_match(store, TINY)
+def test_of_two_saves_of_one_revision_one_is_refused(store, ada, bob, at_once):
+    def post(given):
+        sent = {"layer": "project", "revision": "", "values": given[1]}
+        return given[0].post("/api/settings", json=sent).status_code
 
-    def save_late(*given):
-        with suppress(BrokenBarrierError):
-            both.wait(timeout=0.5)
-        save(*given)
+    codes = at_once(page_settings, post, [(ada, {"iterations": 2}), (bob, {"gates": "auto"})])
+    assert sorted(codes) == [200, 409]
 
-    monkeypatch.setattr(cli_settings, "save_layer", save_late)
-    layers = project_layers(store)
+
+def test_two_commands_that_change_one_layer_both_count(store, at_once):
+    opened, layers = open_match(store, TINY), project_layers(store)
 
     def change(text):
         cli_settings.change_layer(store, "project", layers, [text], [])
 
-    with ThreadPoolExecutor(2) as pool:
-        list(pool.map(change, ("detection.stride=2", "triangulation.min_views=3")))
+    at_once(cli_settings, change, ("detection.stride=2", "triangulation.min_views=3"))
     stated = {"detection.stride": 2, "triangulation.min_views": 3}
     assert read_layer(store, "project").values == stated
     # A run that was opened before keeps what another command has stated since.
@@ -484,15 +463,3 @@ def test_two_commands_that_change_one_layer_both_count(store, monkeypatch):
     settle(store, opened, RunRequest({"triangulation": {"min_views": 4}}))
     own = {"tracking.gate_m": 0.6, "triangulation.min_views": 4}
     assert read_layer(store, f"matches/{TINY}").values == own
-
-
-def test_default_settings_says_what_it_removes(store):
-    own = {"triangulation.min_views": 4, "venue": None, "tracking.gate_m": 0.6}
-    write_layer(store, f"matches/{TINY}", own)
-    told = []
-    with reporting_to(SimpleNamespace(tell_kept_settings=told.append)):
-        request = RunRequest({"tracking": {"gate_m": 0.6}}, default_settings=True)
-        settle(store, open_match(store, TINY), request)
-    (text,) = (each for each in told if "--default-settings" in each)
-    assert "removes triangulation.min_views=4" in text
-    assert read_layer(store, f"matches/{TINY}").values == {"venue": None, "tracking.gate_m": 0.6}

@@ -28,6 +28,7 @@ MISPLACED = {"misplacement_m.cam1": 0.05, "misplacement_m.cam4": 0.08}
 NO_NUMBER = {"misplacement_m.cam1": float("nan"), "misplacement_m.cam2": 0.01}
 MOVED = {"moved_deviations.cam1": 2.9, "moved_deviations.cam4": 7.1}
 WORSE = {"held_out_certain_excess_m.knee": 0.02, "held_out_certain_excess_m.hip": 0.001}
+WRONG = {"clicks_wrong": 2.0, "wrong_click.at_-52.50_0.04.again": 1.0, "wrong_click.b_l": 1.0}
 PLANE = {"unmatched_share": 0.1, "plane_std_m": 9.0}
 ABSENT = {"absent_from_frame": 40, "absent_to_frame": 64, "absent_person": 7}
 
@@ -57,7 +58,7 @@ def test_a_healthy_run_is_usable_and_adjusted_cameras_replace_those_before():
         (
             "retriangulation/clip",
             MISSED,
-            r"of cam1 is matched to a person .* 73 % \(limit 50 %\) .* person 1 in cam1\.",
+            r"is matched .* 73 % \(limit 50 %\) .* person 1 in cam1\.",
         ),
         ("retriangulation/clip", MISPLACED, r"cam4 displaces people in clip by 8 cm \(limit 5"),
         ("retriangulation/clip", {"filled_share": 0.1}, r"no camera sees 10 % \(limit 5 %\)"),
@@ -66,13 +67,8 @@ def test_a_healthy_run_is_usable_and_adjusted_cameras_replace_those_before():
         ("body_fitting/clip", WORSE, r"bodies in clip are farther .* \(knee\), by 2"),
         ("broadcast_calibration/clip", {"expected_error_median_px": 4.0}, r"4 px \(limit 3 px\)"),
         ("static_calibration/cam1", {"clicks_wrong": 5.0}, r"clicks of cam1 contradict .*: 5\. C"),
-        (
-            "static_calibration/cam1",
-            {"clicks_wrong": 2.0, "wrong_click.at_-52.50_0.04.again": 1.0, "wrong_click.b_l": 1.0},
-            r"cam1 contradict .*: 2 \(\(-52\.5, 0\) m, once more, b l\)\. Correct",
-        ),
+        ("static_calibration/cam1", WRONG, r": 2 \(\(-52\.5, 0\) m, once more, b l\)\. Correct"),
         ("broadcast_tracking/clip", PLANE, r"places of people .* 9 m \(limit 1 m\)"),
-        ("tracking/clip", PLANE, r"places of people .* 9 m \(limit 1 m\)"),
         # A metric that is not there, or not a number, is no good one.
         ("triangulation/other", {"unhealthy_share": 0.0}, "could not be computed in other"),
         ("retriangulation/clip", NO_NUMBER, r"misplacement could not be computed in clip \(cam1\)"),
@@ -94,12 +90,9 @@ def test_few_clicks_know_their_noise_badly_and_cameras_may_move_farther(freedom,
     figures = {
         "static_calibration/cam1": {"click_freedom": freedom, "clicks_wrong": 0.0},
         "bundle_adjustment/cameras": {"moved_deviations.cam1": moved},
-        "body_fitting/clip": {"offset_rms_m": 0.01},
     }
-    found = judge_run(RunOutcome(figures=figures), UsableLimits())
-    assert any("contradict the calibration of cam1" in each for each in found.reservations) == (
-        is_said
-    )
+    found = judge_run(RunOutcome(figures=HEALTHY | figures), UsableLimits())
+    assert ("contradict the calibration of cam1" in str(found.reservations)) == is_said
 
 
 @pytest.mark.parametrize(("joints", "is_said"), [(0.0, True), (2550.0, False)])
@@ -150,10 +143,8 @@ def test_failed_units_and_cameras_left_out_are_reservations():
     failed = UnitFailure(unit="filtering/clip", error="E", message="no\n disk")
     found = judge("x/y", failed=[failed], left_out=["camera cam1 is left out: blind."])
     assert found.verdict == "usable with reservations"
-    assert found.reservations == (
-        "filtering/clip failed: no disk",
-        "camera cam1 is left out: blind.",
-    )
+    told = ("filtering/clip failed: no disk", "camera cam1 is left out: blind.")
+    assert found.reservations == told
 
 
 @pytest.mark.parametrize(

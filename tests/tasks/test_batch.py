@@ -16,27 +16,18 @@ from worldpose.store.recipes import recipe_key
 from worldpose.store.store import Store
 
 
+def a_work(project, unit, **about):
+    parts = {key: {} for key in ("sources", "inputs", "settings", "code", "libraries")}
+    recipe = Recipe(match_id="m", stage="tracking", unit=unit, **parts)
+    about |= {"project": project, "folder": "m", "recipe": recipe}
+    return Work(key=recipe_key(recipe), run_id="0001", **about)
+
+
 @pytest.fixture
 def works(tmp_path):
     """Work on three units of a project."""
     Store.create(str(tmp_path))
-    recipes = [
-        Recipe(
-            match_id="m",
-            stage="tracking",
-            unit=unit,
-            sources={},
-            inputs={},
-            settings={},
-            code={},
-            libraries={},
-        )
-        for unit in ("a", "b", "c")
-    ]
-    return [
-        Work(project=str(tmp_path), folder="m", recipe=each, key=recipe_key(each), run_id="0001")
-        for each in recipes
-    ]
+    return [a_work(str(tmp_path), unit) for unit in "abc"]
 
 
 def run(works, compute, monkeypatch):
@@ -45,31 +36,27 @@ def run(works, compute, monkeypatch):
     return batch.batch.fn("tracking", "tasks.tracking", [each.model_dump_json() for each in works])
 
 
-def test_a_units_failure_is_its_own(works, monkeypatch):
-    done = []
-
-    def compute(work):
-        if work.recipe.unit == "b":
-            raise DegenerateError("no person to be seen")
-        done.append(work)
-
-    failures = run(works, compute, monkeypatch)
-    assert [type(each) for each in failures] == [type(None), DegenerateError, type(None)]
-    assert sorted(each.recipe.unit for each in done) == ["a", "c"]
-
-
-def test_what_may_pass_is_tried_again_and_what_is_there_is_not(works, monkeypatch):
+def test_a_units_failure_is_its_own_and_what_may_pass_is_tried_again(works, monkeypatch):
     tried = []
 
     def compute(work):
-        tried.append(work.recipe.unit)
-        if work.recipe.unit == "c" or (tried.count("b") == 1 and work.recipe.unit == "b"):
+        unit = work.recipe.unit
+        tried.append(unit)
+        if unit == "c":
+            raise DegenerateError("no person to be seen")
+        if tried.count("b") < 3:
             raise StoreError("no space")
 
     monkeypatch.setattr(Store, "has", lambda self, match, stage, unit, key: unit == "a")
     failures = run(works, compute, monkeypatch)
-    assert sorted(tried) == ["b", "b", "c", "c", "c"]
-    assert [type(each) for each in failures] == [type(None), type(None), StoreError]
+    assert (sorted(tried), tried.count("b")) == (["b", "b", "b", "c"], 3)  # `a` is there
+    assert [type(each) for each in failures] == [type(None), type(None), DegenerateError]
+    monkeypatch.setattr(Store, "has", lambda *_: False)
+
+    def never(work):
+        raise StoreError("no space")
+
+    assert [type(each) for each in run(works, never, monkeypatch)] == [StoreError] * 3
 
 
 SCRIPT = """
@@ -105,10 +92,7 @@ def test_a_worker_sends_to_the_server_of_its_run_and_keeps_few_connections():
 @pytest.fixture
 def work(tmp_path, monkeypatch):
     at_work(monkeypatch, tmp_path, "tcp://127.0.0.1:1000")
-    nothing = {"sources": {}, "inputs": {}, "settings": {}, "code": {}, "libraries": {}}
-    recipe = Recipe(match_id="m", stage="tracking", unit="c", **nothing)
-    key = recipe_key(recipe)
-    return Work(project="p", folder="m", recipe=recipe, key=key, run_id="0001", seconds=60.0)
+    return a_work("p", "c", seconds=60.0)
 
 
 def at_work(monkeypatch, scratch, scheduler):
@@ -118,13 +102,14 @@ def at_work(monkeypatch, scratch, scheduler):
     monkeypatch.setattr("distributed.get_worker", lambda: worker)
 
 
-def die(work):
+def die(work, seconds=0):
     """Leftovers of a process that ended during its work."""
     pid = os.fork()
     if pid == 0:
         with kill_on_timeout(work):
+            time.sleep(seconds)
             os._exit(9)
-    os.waitpid(pid, 0)
+    return os.waitpid(pid, 0)[1]
 
 
 def test_who_ends_three_processes_is_given_up_once(work, tmp_path):
@@ -159,13 +144,7 @@ def test_who_ends_or_fails_leaves_no_mark(work, tmp_path):
 def test_who_takes_too_long_is_ended_and_given_up_the_second_time(work, tmp_path):
     hasty = work.model_copy(update={"seconds": 0.2})
     for _ in range(2):
-        pid = os.fork()
-        if pid == 0:
-            with kill_on_timeout(hasty):
-                time.sleep(60)
-            os._exit(0)
-        _, status = os.waitpid(pid, 0)
-        assert os.WIFSIGNALED(status)
+        assert os.WIFSIGNALED(die(hasty, 60))
     with pytest.raises(TaskTimeoutError, match=r"stopped 2 times.*test_batch\.py"):
         kill_on_timeout(hasty).__enter__()
     assert list(tmp_path.iterdir()) == []

@@ -38,32 +38,24 @@ def array(values, *dims):
 
 
 def camera(frames, count, rng):
-    shapes = {name: [count if d == "detection" else SIZES[d] for d in DIMS[name]] for name in DIMS}
-    return xr.Dataset(
-        {
-            name: array(rng.random((frames, *shape), dtype=np.float32), *DIMS[name])
-            for name, shape in shapes.items()
-        }
-    )
+    def random(name):
+        shape = [count if dim == "detection" else SIZES[dim] for dim in DIMS[name]]
+        return array(rng.random((frames, *shape), dtype=np.float32), *DIMS[name])
+
+    return xr.Dataset({name: random(name) for name in DIMS})
 
 
 def test_rejected_keypoints_are_gone_and_lasting_errors_taken_off():
     frames = PAGE + 3  # over the border of a page
     rng = np.random.default_rng(0)
     cameras = [camera(frames, count, rng) for count in (2, 1)]
-    filtering = xr.Dataset(
-        {
-            "rejected": array(rng.random((frames, 2, 2, 17)) < 0.1, "camera", "detection", "joint"),
-            "shift": array(
-                rng.random((frames, 2, 2, 17, 2), dtype=np.float32),
-                *("camera", "detection", "joint", "axis"),
-            ),
-        }
-    )
-    frame = np.arange(frames)
+    dims = ("camera", "detection", "joint", "axis")
+    rejected = array(rng.random((frames, 2, 2, 17)) < 0.1, *dims[:3])
+    shift = array(rng.random((frames, 2, 2, 17, 2), dtype=np.float32), *dims)
+    filtering, frame = xr.Dataset({"rejected": rejected, "shift": shift}), np.arange(frames)
     plain = open_detections(cameras, frame, StoredFeedback(cameras))[5:frames]
     taken = open_detections(cameras, frame, StoredFeedback(cameras, filtering))[5:frames]
-    rejected, shift = filtering["rejected"].values[5:], filtering["shift"].values[5:]
+    rejected, shift = rejected.values[5:], shift.values[5:]
     assert np.isnan(taken.keypoints[rejected]).all() and np.isnan(taken.confidence[rejected]).all()
     kept = ~rejected & np.isfinite(plain.confidence)
     moved = plain.keypoints[kept] - taken.keypoints[kept]
@@ -202,38 +194,33 @@ def test_people_are_looked_for_where_the_image_shows_them(late_clips, monkeypatc
         across = np.broadcast_to(np.tile([-0.2, 0.2], 9)[:17], (len(time), 17))
         return np.stack([across + 0.2 * time[:, None], 0.0 * across, height + 0.0 * across], -1)
 
-    joints = body(frame)[:, None]
-    cameras = camera_arrays(Camera.stack([eye]))
-    late_clips |= {
-        "detection/s": late_clips["s/a"],
-        ADJUSTED: xr.Dataset(
-            {n: ([f"{n}{k}" for k in range(a.ndim)], a) for n, a in cameras.items()},
-            attrs={"surface": None},
-        ),
-        "body_fitting/a": xr.Dataset(
-            {
-                "joints": array(joints, "person", "joint", "axis"),
-                "covariance": array(1e-4 * np.tile(np.eye(3), (10, 1, 17, 1, 1)), *"pjab"),
-                "joint_offsets": (("joint", "axis"), np.zeros((17, 3))),
-            },
-            {"person": [3]},
-        ),
-        "retriangulation/a": xr.Dataset(
-            {
-                "common_bias": ("joint", np.zeros(17)),
-                "offsets": array(np.zeros((10, 1, 1, 2)), "camera", "person", "axis"),
-                "exchanged": array(np.zeros((10, 1, 1, 5), bool), *"cpk"),
-            }
-        ),
-        "filtering/a": xr.Dataset(
-            {
-                "view_bias": (("joint", "axis", "term"), np.zeros((17, 2, TERMS))),
-                "clock_late": ("camera", np.zeros(1)),
-                "fits": array(np.zeros((10, 1, 1), int), "camera", "detection"),
-                "dropped": array(np.zeros((10, 1, 1), bool), "camera", "detection"),
-            }
-        ),
-    }
+    def data(name, attrs=None, coords=None, **arrays):
+        late_clips[name] = xr.Dataset(arrays, coords, attrs)
+
+    late_clips["detection/s"] = late_clips["s/a"]
+    known = camera_arrays(Camera.stack([eye])).items()
+    known = {n: ([f"{n}{k}" for k in range(a.ndim)], a) for n, a in known}
+    data(ADJUSTED, {"surface": None}, **known)
+    data(
+        "body_fitting/a",
+        coords={"person": [3]},
+        joints=array(body(frame)[:, None], "person", "joint", "axis"),
+        covariance=array(1e-4 * np.tile(np.eye(3), (10, 1, 17, 1, 1)), *"pjab"),
+        joint_offsets=(("joint", "axis"), np.zeros((17, 3))),
+    )
+    data(
+        "retriangulation/a",
+        common_bias=("joint", np.zeros(17)),
+        offsets=array(np.zeros((10, 1, 1, 2)), "camera", "person", "axis"),
+        exchanged=array(np.zeros((10, 1, 1, 5), bool), *"cpk"),
+    )
+    data(
+        "filtering/a",
+        view_bias=(("joint", "axis", "term"), np.zeros((17, 2, TERMS))),
+        clock_late=("camera", np.zeros(1)),
+        fits=array(np.zeros((10, 1, 1), int), "camera", "detection"),
+        dropped=array(np.zeros((10, 1, 1), bool), "camera", "detection"),
+    )
     late_clips["tracking/a"] = late_clips["tracking/a"].assign_coords(camera=["cam"])
     # The camera turns before frame 6, or nothing explains its views.
     given = {"first_frame": 0, "frame_count": 10, "shift_px": (30.0, 0.0), "std": 0.1}
@@ -312,28 +299,18 @@ def runner(frame):
 
 @pytest.mark.parametrize(("feed_offset", "late"), [("report", -0.25), ("correct", 1.25)])
 def test_pictures_are_late_by_what_rounding_leaves_and_what_was_measured(feed_offset, late):
-    arrays = camera_arrays(beside(3))
-    seen = xr.Dataset(
-        {"keypoints": (("frame", "detection", "joint", "axis"), np.zeros((3, 1, 17, 2)))},
-        coords={"frame": [100, 101, 102]},
-    )
-    found = xr.Dataset(
-        {
-            name: ([f"{name}_{axis}" for axis in range(values.ndim)], values)
-            for name, values in {**arrays, "reprojection_error": np.array([1.0, 2.5, 2.0])}.items()
-        },
-        attrs={"feed_offset": {"frames": 1.5}},
-    )
-    results = {"broadcast_calibration/clip": found, "ingest/clip": seen}
+    keypoints = (("frame", "detection", "joint", "axis"), np.zeros((3, 1, 17, 2)))
+    arrays = {**camera_arrays(beside(3)), "reprojection_error": np.array([1.0, 2.5, 2.0])}
+    found = {n: ([f"{n}_{axis}" for axis in range(a.ndim)], a) for n, a in arrays.items()}
+    results = {
+        "broadcast_calibration/clip": xr.Dataset(found, attrs={"feed_offset": {"frames": 1.5}}),
+        "ingest/clip": xr.Dataset({"keypoints": keypoints}, {"frame": [100, 101, 102]}),
+    }
     calibrated = SimpleNamespace(recipe=SimpleNamespace(settings={"feed_offset": feed_offset}))
+    sources = {"offset_frames": 4, "broadcast_offset_frames": 104.25, "estimates": None}
     inputs = SimpleNamespace(
         unit="clip",
-        sources={
-            "offset_frames": 4,
-            "broadcast_offset_frames": 104.25,
-            "seen_in_broadcast": "ingest/clip",
-            "estimates": None,
-        },
+        sources=sources | {"seen_in_broadcast": "ingest/clip"},
         frames=np.arange(100, 103),
         open=results.__getitem__,
         open_first=lambda pooled, calibrated: results[calibrated],
@@ -373,19 +350,14 @@ def test_bodies_of_pictures_that_are_late_are_those_of_the_frames(late):
 def test_names_give_a_shape_only_to_people_who_can_be_the_same(monkeypatch):
     model = find_body()
     monkeypatch.setattr(refitting, "find_same_body", lambda before: model)
-    count = model.shapes
 
     def bodies(*first):
-        betas = np.zeros((len(first), count))
+        betas = np.zeros((len(first), model.shapes))
         betas[:, 0] = first
-        covariance = np.tile(0.2 * np.eye(count), (len(first), 1, 1))
-        return xr.Dataset(
-            {
-                "betas": (("person", "beta"), betas),
-                "betas_covariance": (("person", "a", "b"), covariance),
-            },
-            {"person": np.arange(len(first))},
-        )
+        covariance = np.tile(0.2 * np.eye(model.shapes), (len(first), 1, 1))
+        arrays = {"betas": (("person", "beta"), betas)}
+        arrays["betas_covariance"] = (("person", "a", "b"), covariance)
+        return xr.Dataset(arrays, {"person": np.arange(len(first))})
 
     fitted = {"body_fitting/a": bodies(0.0, 1.0, 2.0), "body_fitting/b": bodies(1.1, -4.0)}
     names = {"a": {"1": "kane", "2": "rice", "99": "saka"}, "b": {"0": "kane", "1": "rice"}}

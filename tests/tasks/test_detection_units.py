@@ -25,6 +25,9 @@ from worldpose.store.store import Store
 
 OFFSETS = {"left": 0, "right": 3}
 CLIPS = [("early", 2, 12), ("late", 20, 10)]
+NAMES = [stage.name for stage in METHOD]
+DETECTED = NAMES[NAMES.index("detection") + 1]
+"""The first stage that uses detections."""
 
 
 class Reading:
@@ -58,10 +61,10 @@ def filmed(tmp_path):
     return tmp_path / "match"
 
 
-def computed(store, match, stages):
-    """Results of the first stages, by `stage/unit`; those that are there are not computed."""
+def computed(store, match, until="tracking"):
+    """Results of the stages before one, by `stage/unit`; those that are there are not computed."""
     results = {}
-    for stage in METHOD[:stages]:
+    for stage in METHOD[: NAMES.index(until)]:
         for unit in RunPlan(store, match, {}, results=results).plan_stage(stage):
             if not unit.published:
                 task_of(stage).fn(unit.work(store.url, match, "0001"))
@@ -69,16 +72,25 @@ def computed(store, match, stages):
     return results
 
 
-def test_people_of_videos_reach_tracking_on_the_match_s_clock(filmed, tmp_path, reading):
+@pytest.fixture
+def project(tmp_path):
+    """A store, and what registers a match in it and computes its stages."""
     store = Store.create(tmp_path / "project")
-    match, _ = register(store, filmed)
-    names = [stage.name for stage in METHOD]
-    results = computed(store, match, names.index("tracking"))
+
+    def compute(folder, until="tracking"):
+        match, _ = register(store, folder)
+        return match, computed(store, match, until)
+
+    return store, compute
+
+
+def test_people_of_videos_reach_tracking_on_the_match_s_clock(filmed, project, reading):
+    store, compute = project
+    match, results = compute(filmed)
     late = store.open_result("filmed", "ingest", "right", results["ingest/right"])
     # Frames 20 to 29 are images 23 to 32 of `right`, which has 31.
     assert late.attrs["video"]["missing_frames"] == [[28, 29]]
-    plan = RunPlan(store, match, {}, results=results)
-    planned = plan.plan_stage(METHOD[names.index("tracking")])
+    planned = RunPlan(store, match, {}, results=results).plan_stage(METHOD[NAMES.index("tracking")])
     early, late = (unit.work(store.url, match, "0001") for unit in planned)
     assert set(early.recipe.inputs) == {
         *("detection/left.early", "detection/right.early"),
@@ -94,45 +106,37 @@ def test_people_of_videos_reach_tracking_on_the_match_s_clock(filmed, tmp_path, 
         assert clip.detections.frame.tolist() == frames.tolist()
     # All clips at once, as bundle adjustment takes them.
     chosen = {"early": np.array([3, 7]), "late": np.array([21, 28])}
-    recipe = late.recipe.model_copy(
-        update={
-            "inputs": late.recipe.inputs | early.recipe.inputs,
-            "sources": late.recipe.sources
-            | {
-                "seen": {"early": early.recipe.sources["seen"], "late": late.recipe.sources["seen"]}
-            },
-        }
-    )
+    seen = {clip: work.recipe.sources["seen"] for clip, work in (("early", early), ("late", late))}
+    inputs, sources = late.recipe.inputs | early.recipe.inputs, late.recipe.sources
+    recipe = late.recipe.model_copy(update={"inputs": inputs, "sources": sources | {"seen": seen}})
     both = open_frames(UnitInputs(store, late.model_copy(update={"recipe": recipe})), chosen)
     np.testing.assert_array_equal(
         both.detections.keypoints[:, :, 0, 0, 0], [[3, 6], [7, 10], [21, 24], [28, np.nan]]
     )
-    figures = store.manifest("filmed", "detection", "right.late", results["detection/right.late"])
-    assert figures.figures["unreadable_share"] == pytest.approx(0.2)
-    gap = [figures.figures[f"unreadable_{end}_frame"] for end in ("from", "to")]
-    assert gap == [28.0, 29.0]
+    key = results["detection/right.late"]
+    figures = store.manifest("filmed", "detection", "right.late", key).figures
+    assert figures["unreadable_share"] == pytest.approx(0.2)
+    assert [figures[f"unreadable_{end}_frame"] for end in ("from", "to")] == [28.0, 29.0]
 
 
-def test_a_camera_may_film_one_clip_alone(tmp_path, reading):
+def test_a_camera_may_film_one_clip_alone(tmp_path, project, reading):
     greys = {name: [10 + 4 * n for n in range(count)] for name, count in (("a", 40), ("b", 15))}
     write_filmed(tmp_path / "match", greys, CLIPS)
-    store = Store.create(tmp_path / "project")
-    match, _ = register(store, tmp_path / "match")
-    results = computed(store, match, [stage.name for stage in METHOD].index("tracking"))
+    store, compute = project
+    _, results = compute(tmp_path / "match")
     alone = store.open_result("filmed", "detection", "b.late", results["detection/b.late"])
     assert dict(alone.sizes)["detection"] == 0
     told = store.manifest("filmed", "ingest", "b", results["ingest/b"]).warnings
     assert any("it shows frames 2 to 13 of 2 to 29" in text for text in told)
 
 
-def test_frames_that_share_an_image_or_go_back_are_detected_in_it(tmp_path, reading):
+def test_frames_that_share_an_image_or_go_back_are_detected_in_it(tmp_path, project, reading):
     greys = {name: [10 + 4 * n for n in range(40)] for name in ("slow", "fast")}
     # A camera that loses a frame, and one whose stated offsets make its numbers go back.
     offsets = {"slow": ((5, 0.0), (6, -1.0)), "fast": ((5, 0.0), (6, -3.0))}
     write_filmed(tmp_path / "match", greys, [("clip", 0, 12)], offsets=offsets)
-    store = Store.create(tmp_path / "project")
-    match, _ = register(store, tmp_path / "match")
-    results = computed(store, match, [stage.name for stage in METHOD].index("tracking"))
+    store, compute = project
+    _, results = compute(tmp_path / "match")
     for name, lost in (("slow", 1), ("fast", 3)):
         unit = f"detection/{name}.clip"
         seen = store.open_result("filmed", *unit.split("/"), results[unit])["keypoints"]
@@ -140,7 +144,7 @@ def test_frames_that_share_an_image_or_go_back_are_detected_in_it(tmp_path, read
         np.testing.assert_array_equal(seen.values[:, 0, 0, 0], expected)
 
 
-def test_a_video_of_which_no_image_can_be_decoded_fails_with_its_name(filmed, tmp_path, reading):
+def test_a_video_of_which_no_image_can_be_decoded_fails_with_its_name(filmed, project, reading):
     path = filmed / "videos" / "left.mp4"
     with av.open(str(path)) as video:
         places = [(packet.pos, packet.size) for packet in video.demux(video=0) if packet.size]
@@ -148,30 +152,24 @@ def test_a_video_of_which_no_image_can_be_decoded_fails_with_its_name(filmed, tm
     for place, size in places:
         content[place : place + size] = bytes(size)
     path.write_bytes(content)
-    store = Store.create(tmp_path / "project")
-    match, _ = register(store, filmed)
     with pytest.raises(InputError, match=r"left\.mp4.*none in 12 frames"):
-        computed(store, match, [stage.name for stage in METHOD].index("tracking"))
+        project[1](filmed)
 
 
 def test_a_corrected_detection_is_the_same_whether_or_not_the_nets_look_again(
     filmed, tmp_path, reading, monkeypatch
 ):
-    edit = DeletedDetection(camera="left", frame=4, detection=0)
-    said = correction(edit, match_id="filmed")
+    said = correction(DeletedDetection(camera="left", frame=4, detection=0), match_id="filmed")
     monkeypatch.setattr(DetectionReport, "why_no_person", lambda self: "told")
-    stages = [stage.name for stage in METHOD].index("detection") + 1
     found = []
     for project in ("fresh", "kept"):
         store = Store.create(tmp_path / project)
         match, _ = register(store, filmed)
-        corrected = replace(match, corrections=(said,))
-        if project == "fresh":
-            after = computed(store, corrected, stages)
-        else:
-            before = computed(store, match, stages)
+        if project == "kept":
+            before = computed(store, match, DETECTED)
             monkeypatch.setattr(tasks.detection, "load_detectors", None)  # would fail
-            after = computed(store, corrected, stages)
+        after = computed(store, replace(match, corrections=(said,)), DETECTED)
+        if project == "kept":
             assert {n for n in after if after[n] != before[n]} == {"detection/left.early"}
         unit = ("filmed", "detection", "left.early", after["detection/left.early"])
         found.append((store.manifest(*unit), store.open_result(*unit)["score"].values))
@@ -184,33 +182,27 @@ def test_a_corrected_detection_is_the_same_whether_or_not_the_nets_look_again(
     assert (metrics[0], fresh.figures["corrections_refused"]) == (metrics[1], 0)
 
 
-def test_a_video_that_is_not_what_match_yaml_says_is_refused_at_once(filmed, tmp_path):
-    store = Store.create(tmp_path / "project")
-    text = (filmed / "match.yaml").read_text()
-    for old, new, told in (
-        ("width: 64", "width: 66", "66 x 48 px"),
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
         ("fps: 25.0", "fps: 50.0", "50 frames per second"),
         ("first_frame: 20", "first_frame: 60", "frames 60 to 69"),
-    ):
-        assert old in text
-        other = text.replace(old, new)
-        (filmed / "match.yaml").write_text(other)
-        if old.startswith("width"):
-            (filmed / "calibration.toml").rename(filmed / "away")
-            (filmed / "calibration.toml").write_text(
-                (filmed / "away").read_text().replace("64", "66", 2)
-            )
-        with pytest.raises(InputError, match=told):
-            register(store, filmed)
-        if old.startswith("width"):
-            (filmed / "away").rename(filmed / "calibration.toml")
+        ("width: 64", "width: 66", "66 x 48 px"),
+    ],
+)
+def test_a_video_that_is_not_what_match_yaml_says_is_refused_at_once(
+    filmed, project, old, new, told
+):
+    for file in (filmed / "match.yaml", filmed / "calibration.toml"):
+        text = file.read_text()
+        file.write_text(text.replace("64", "66", 2) if "width" in old else text.replace(old, new))
+    with pytest.raises(InputError, match=told):
+        project[1](filmed)
 
 
-def test_given_boxes_take_the_place_of_the_detector(filmed, tmp_path, reading, monkeypatch):
-    store = Store.create(tmp_path / "project")
-    match, _ = register(store, filmed)
-    stages = [stage.name for stage in METHOD].index("detection") + 1
-    before = computed(store, match, stages)
+def test_given_boxes_take_the_place_of_the_detector(filmed, tmp_path, project, reading):
+    store, compute = project
+    _, before = compute(filmed, DETECTED)
     (tmp_path / "boxes").mkdir()
     # Two people in every other image of `right`, whose offset is 3 frames; images count from 1.
     lines = [
@@ -220,47 +212,41 @@ def test_given_boxes_take_the_place_of_the_detector(filmed, tmp_path, reading, m
     ]
     (tmp_path / "boxes" / "right.txt").write_text("\n".join(lines))
     assert import_boxes(tmp_path / "boxes", filmed) == {"right": 32}
-    match, changed = register(store, filmed)
-    assert changed
-    after = computed(store, match, stages)
-    assert {name for name in after if after[name] != before[name]} == {
-        *("detection/right.early", "detection/right.late")
-    }
-    seen = store.open_result("filmed", "detection", "right.early", after["detection/right.early"])
+    _, after = compute(filmed, DETECTED)
+    changed = {name for name in after if after[name] != before[name]}
+    assert changed == {"detection/right.early", "detection/right.late"}
+    unit = ("filmed", "detection", "right.early", after["detection/right.early"])
     images = np.arange(2, 14) + 3
     expected = np.where((images % 2 == 0)[:, None], np.stack([images, images], axis=1), np.nan)
-    found = seen["keypoints"].values[:, :, 0]
+    found = store.open_result(*unit)["keypoints"].values[:, :, 0]
     np.testing.assert_array_equal(found[..., 0], expected)
     np.testing.assert_array_equal(found[..., 1], np.where(np.isnan(expected), np.nan, [10.0, 20.0]))
-    manifest = store.manifest("filmed", "detection", "right.early", after["detection/right.early"])
+    manifest = store.manifest(*unit)
     assert manifest.figures["empty_share"] == 0.5
     assert not any("bundled detector" in text for text in manifest.warnings)
 
 
-def test_other_weights_than_planned_with_are_refused(filmed, tmp_path, reading, monkeypatch):
-    store = Store.create(tmp_path / "project")
-    match, _ = register(store, filmed)
-    names = [stage.name for stage in METHOD]
-    results = computed(store, match, names.index("detection"))
-    plan = RunPlan(store, match, {}, results=results)
-    planned = plan.plan_stage(METHOD[names.index("detection")])
+def test_other_weights_than_planned_with_are_refused(filmed, project, reading, monkeypatch):
+    store, compute = project
+    match, results = compute(filmed, "detection")
+    stage = METHOD[NAMES.index("detection")]
+    planned = RunPlan(store, match, {}, results=results).plan_stage(stage)
     monkeypatch.setattr(tasks.detection, "weights_of", lambda settings: {"embedded": "another"})
     with pytest.raises(InputError, match="planned with"):
-        task_of(METHOD[names.index("detection")]).fn(planned[0].work(store.url, match, "0001"))
+        task_of(stage).fn(planned[0].work(store.url, match, "0001"))
 
 
 @pytest.mark.parametrize(("tall", "told"), [(20.0, False), (900.0, True)])
 def test_people_too_large_for_the_bundled_detector_are_told(
-    filmed, tmp_path, reading, monkeypatch, tall, told
+    filmed, project, reading, monkeypatch, tall, told
 ):
     boxes = np.array([[0.0, 0.0, 8.0, tall]])
     detect = staticmethod(lambda pictures: [People(boxes, np.array([0.9])) for _ in pictures])
     monkeypatch.setattr(Reading, "detect", detect)
-    store = Store.create(tmp_path / "project")
-    match, _ = register(store, filmed)
-    results = computed(store, match, [stage.name for stage in METHOD].index("tracking"))
-    warnings = store.manifest("filmed", "detection", "left.late", results["detection/left.late"])
-    assert any("people of 28 to 160 px" in text for text in warnings.warnings) == told
+    store, compute = project
+    key = compute(filmed)[1]["detection/left.late"]
+    warnings = store.manifest("filmed", "detection", "left.late", key).warnings
+    assert any("people of 28 to 160 px" in text for text in warnings) == told
 
 
 def test_boxes_of_one_camera_and_a_broken_video_do_not_refuse_the_match(tmp_path):

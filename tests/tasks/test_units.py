@@ -13,11 +13,8 @@ from camera_builders import look_at_camera
 from prefect.states import Failed
 
 from data_contracts.static_calibration import ClickedMarkings
-from flows.match import task_of
-from flows.method import METHOD
 from flows.registering import register
 from flows.run_plan import plan_run
-from flows.run_record import RunLog
 from tasks.ingest import ingest
 from tasks.static_calibration import static_calibration
 from tasks.unit import unit_task
@@ -50,9 +47,13 @@ def planned(tiny, tmp_path):
     return store, match, plan_run(store, match, {})[0]
 
 
-def test_every_stage_has_its_task():
-    for stage in METHOD:
-        assert task_of(stage).fn.__name__ == stage.name
+def calibrated(store, match, camera=None, unit=None):
+    """A camera's calibration, computed in this process, and its manifest."""
+    plan = (u for u in plan_run(store, match, {}) if u.recipe.stage == "static_calibration")
+    unit = unit or next(u for u in plan if camera in (None, u.recipe.unit))
+    static_calibration.fn(unit.work(store.url, match, "0001"))
+    place = (match.match_id, "static_calibration", unit.recipe.unit, unit.key)
+    return store.open_result(*place), store.manifest(*place)
 
 
 def test_an_edit_after_planning_does_not_reach_the_result(planned, tmp_path):
@@ -62,15 +63,13 @@ def test_an_edit_after_planning_does_not_reach_the_result(planned, tmp_path):
     text = calibration.read_text()
     calibration.write_text(text.replace("translation = [", "translation = [1", 1))
     assert calibration.read_text() != text
-    static_calibration.fn(unit.work(store.url, match, "0001"))
-    stored = store.open_result(match.match_id, "static_calibration", unit.recipe.unit, unit.key)
+    stored, _ = calibrated(store, match, unit=unit)
     planned_translation = unit.recipe.sources["calibration"]["translation"]
     assert stored["translation"].values.tolist() == pytest.approx(planned_translation)
     assert stored.attrs["origin"] == "given"
 
 
 def test_a_run_tells_of_a_given_lens_that_folds_at_the_corners(planned, tmp_path):
-    store, match, _ = planned
     calibration = tmp_path / "match" / "calibration.toml"
     (given, *_) = tomllib.loads(calibration.read_text()).values()
     corner = math.hypot(*given["size"]) / 2 / given["matrix"][0][0]
@@ -78,12 +77,9 @@ def test_a_run_tells_of_a_given_lens_that_folds_at_the_corners(planned, tmp_path
     folds = f"distortions = [{-((2 / (3 * 0.9 * corner)) ** 2) / 3}, 0, 0, 0, 0]"
     text = re.sub(r"distortions = \[.*\]", folds, calibration.read_text(), count=1)
     calibration.write_text(text)
-    match, _ = register(store, tmp_path / "match")
-    unit = next(u for u in plan_run(store, match, {}) if u.recipe.stage == "static_calibration")
-    static_calibration.fn(unit.work(store.url, match, "0001"))
-    written = store.manifest(match.match_id, "static_calibration", unit.recipe.unit, unit.key)
-    (said,) = written.warnings
-    assert said.startswith(f"{unit.recipe.unit}: the lens model folds within the image")
+    match, _ = register(planned[0], tmp_path / "match")
+    (said,) = calibrated(planned[0], match)[1].warnings
+    assert ": the lens model folds within the image" in said
 
 
 def test_an_imported_lens_is_the_prior_of_its_camera_and_of_no_other(clicked, tmp_path):
@@ -91,22 +87,15 @@ def test_an_imported_lens_is_the_prior_of_its_camera_and_of_no_other(clicked, tm
     folder = match.folder.folder
     truth = read_camera(folder / "reference" / "cameras" / "cam00.npz")
     (fx, fy), (cx, cy) = np.ravel(truth.focal)[:2], np.ravel(truth.principal_point)[:2]
-    np.savez(
-        tmp_path / "lens.npz",
-        mtx=[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]],
-        dist=np.ravel(truth.distortion)[:5],
-    )
+    matrix = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
+    np.savez(tmp_path / "lens.npz", mtx=matrix, dist=np.ravel(truth.distortion)[:5])
     lens = import_lenses([tmp_path / "lens.npz"], folder, "cam00")["cam00"]
-    match, changed = register(store, folder)
-    assert changed
-    assert match.registration.digest_of("lenses.toml")
-    planned = {unit.name: unit for unit in plan_run(store, match, {})}
-    changed = {name for name in units if planned[name].key != units[name].key}
+    match, is_new = register(store, folder)
+    assert is_new and match.registration.digest_of("lenses.toml")
+    changed = {u.name for u in plan_run(store, match, {}) if u.key != units[u.name].key}
     assert "static_calibration/cam00" in changed
     assert not {name for name in changed if name.startswith("static_calibration/cam01")}
-    unit = planned["static_calibration/cam00"]
-    static_calibration.fn(unit.work(store.url, match, "0001"))
-    stored = store.open_result(match.match_id, "static_calibration", "cam00", unit.key)
+    stored, _ = calibrated(store, match, "cam00")
     assert stored["focal"].values[0] == pytest.approx(lens.focal_px, rel=0.01)
     assert any("the given lens" in each for each in stored.attrs["decisions"])
     with pytest.raises(InputError, match=r"lenses\.toml: cam00.*expected no lens"):
@@ -156,21 +145,17 @@ def test_a_stated_side_decides_clicks_that_both_sides_see_alike(clicked):
         drawn.append({"name": name, "xy": pixels[inside].tolist()})
     clicks = folder / "annotations" / "static_calibration" / "cam00.json"
     clicks.write_text(json.dumps(json.loads(clicks.read_text()) | {"points": [], "drawn": drawn}))
+    pitch, given = PitchDrawing(PitchTemplate.standard()), ClickedMarkings(drawn=drawn)
     for side in (None, "near", "far"):
         spec["cameras"][0] |= {"width": 1920, "height": 1080, "side": side}
         (folder / "match.yaml").write_text(yaml.safe_dump(spec))
         match, _ = register(store, folder)
-        unit = next(u for u in plan_run(store, match, {}) if u.name == "static_calibration/cam00")
-        static_calibration.fn(unit.work(store.url, match, "0001"))
-        stored = store.open_result(match.match_id, "static_calibration", "cam00", unit.key)
+        stored, _ = calibrated(store, match, "cam00")
         center = camera_from_arrays(stored.data_vars).center if stored.data_vars else np.zeros(3)
         found[side] = np.sign(np.ravel(center)[1])
         if side:  # the page shows what the run takes
-            pitch, given = PitchDrawing(PitchTemplate.standard()), ClickedMarkings(drawn=drawn)
-            assert (
-                np.sign(preview(pitch, given, (1920, 1080), side=side).camera.center[1])
-                == (found[side])
-            )
+            shown = preview(pitch, given, (1920, 1080), side=side).camera
+            assert np.sign(shown.center[1]) == found[side]
     assert found == {None: 0.0, "near": -1.0, "far": 1.0}
 
 
@@ -230,9 +215,7 @@ def test_what_may_pass_is_tried_again(failure, retried):
     ],
 )
 def test_a_bug_in_a_unit_is_not_blamed_on_the_match(planned, monkeypatch, raised, told):
-    _, match, _ = planned
-    store = planned[0]
-    unit = plan_run(store, match, {})[0]
+    store, match, unit = planned
 
     def compute(inputs, result):
         raise raised
@@ -240,25 +223,4 @@ def test_a_bug_in_a_unit_is_not_blamed_on_the_match(planned, monkeypatch, raised
     monkeypatch.setattr("tasks.unit.require_same_code", lambda work, module: None)
     with pytest.raises(WorldposeError) as caught:
         unit_task(compute).fn(unit.work(store.url, match, "0001"))
-    assert unit.name in str(caught.value)
-    assert told in str(caught.value)
-
-
-def test_units_behind_a_failed_one_are_recorded_as_blocked(planned):
-    store, match, first = planned
-    failed = f"static_calibration/{first.recipe.unit}"
-    log = RunLog.begin(store, match, METHOD, {})
-    for stage in METHOD:
-        for unit in log.plan.plan_stage(stage):
-            if unit.name != failed:
-                task_of(stage).fn(unit.work(store.url, match, log.run_id))
-            log.finish_unit(unit, RuntimeError("x") if unit.name == failed else None)
-    record = log.close()
-    assert record.state == "failed"
-    assert [failure.unit for failure in record.failed] == [failed]
-    assert record.blocked == (
-        *("body_fitting/clip", "bundle_adjustment/cameras", "camera_consistency/clip"),
-        *("filtering/clip", "retriangulation/clip", "tracking/clip", "triangulation/clip"),
-    )
-    # The other cameras have their results: only what needs all of them waits.
-    assert len(record.executed) == len(plan_run(store, match, {})) - 8
+    assert unit.name in str(caught.value) and told in str(caught.value)
