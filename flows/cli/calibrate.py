@@ -10,6 +10,7 @@ import typer
 from data_contracts.arrays import Image
 from flows.cli.console import errors, line, print_json, print_table
 from worldpose.errors import InputError, UsageError, unknown_name
+from worldpose.formats.calibration_files import camera_id
 from worldpose.video.names import is_video
 
 if TYPE_CHECKING:
@@ -88,14 +89,17 @@ def calibrate(
 
 def _cameras(boards: Path, camera: str | None) -> dict[str, Path]:
     """Return the folder or video of each camera."""
+    camera = None if camera is None else camera_id(camera)
     found = sorted(boards.glob("[!.]*"))
     if any(file.suffix.lower() in IMAGES for file in found) or boards.is_file():
         return {camera or _camera_name(boards): boards}
-    places = {
-        _camera_name(place): place
-        for place in found
-        if is_video(place) or (place.is_dir() and _images(place))
-    }
+    places: dict[str, Path] = {}
+    for place in found:
+        if not (is_video(place) or (place.is_dir() and _images(place))):
+            continue
+        if (first := places.setdefault(_camera_name(place), place)) != place:
+            two, todo = f"{first.name} and {place.name}", "Name each after its camera."
+            raise InputError(str(boards), "one folder or video of each camera", two, todo)
     if not places:
         raise InputError(
             str(boards),
@@ -109,8 +113,9 @@ def _cameras(boards: Path, camera: str | None) -> dict[str, Path]:
 
 
 def _camera_name(place: Path) -> str:
-    """Return a camera's name by its folder or video; `int_cam01_img`, as in Pose2Sim, is cam01."""
-    return place.stem.removeprefix("int_").removesuffix("_img")
+    """Return a camera's id by its folder or video; `int_cam01_img`, as in Pose2Sim, is cam01."""
+    name = place.stem if place.is_file() else place.absolute().name
+    return camera_id(name.removeprefix("int_").removesuffix("_img"))
 
 
 def _images(folder: Path) -> list[Path]:

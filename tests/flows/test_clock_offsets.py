@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -13,6 +14,7 @@ from command_line import invoke, succeed
 from run_records import calibration, match_spec
 
 from data_contracts.cameras import LensCalibration
+from flows.cli.calibrate import _cameras
 from flows.cli.locate import _lens, _print_offsets
 from flows.results.clock_offsets import ClockOffsets, Proposal, propose
 from flows.run_record import latest_run
@@ -191,6 +193,18 @@ def test_images_and_a_video_become_lenses(boards, tmp_path):
     assert "<svg" in plot.read_text()
     refused = invoke("calibrate", boards, *OPTIONS, "--out", out, "--camera", "a")
     assert "a new file" in str(refused.exception), "people edit lenses"
+
+
+def test_folders_and_videos_of_boards_are_called_as_cameras(tmp_path, monkeypatch):
+    for name in ("cam.1", "cam.2", "int_Süd 1.2_img"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "0.png").touch()
+    assert [*_cameras(tmp_path, None)] == ["cam.1", "cam.2", "Sud-1.2"]
+    (tmp_path / "cam.2.mp4").touch()
+    with pytest.raises(InputError, match=r"each camera, found cam\.2 and cam\.2\.mp4"):
+        _cameras(tmp_path, None)
+    monkeypatch.chdir(tmp_path / "cam.1")
+    assert [*_cameras(Path(), None)] == ["cam.1"]
 
 
 def test_squares_in_place_of_corners_are_told(boards, tmp_path):

@@ -50,10 +50,6 @@ def edit_click(store):
     file.write_text(text)
 
 
-def add_file(store):
-    (Path(store.registration(TINY).folder) / "roster.txt").write_text("Ada")
-
-
 def withdraw(store):
     (name, key) = next(iter(store.run(TINY).results.items()))
     store.withdraw(ResultId.from_name(TINY, name, key))
@@ -77,7 +73,9 @@ def damage(store):
 CHANGES = {
     "a correction": correct,
     "an edited file of the match": edit_click,
-    "a new file of the match": add_file,
+    "a new file of the match": lambda store: (
+        Path(store.registration(TINY).folder) / "roster.txt"
+    ).write_text("Ada"),
     "a setting of the project": lambda store: write_layer(
         store, "project", {"detection.stride": 2}
     ),

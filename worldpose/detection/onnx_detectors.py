@@ -326,10 +326,6 @@ def _decode_with_object(outputs: Outputs, _: tuple[int, int], people: Sequence[i
     return decode_grid(outputs[0], people, with_object=True)
 
 
-def _decode_columns(outputs: Outputs, _: tuple[int, int], people: Sequence[int]) -> People:
-    return decode_grid(outputs[0].T, people, with_object=False)
-
-
 def _decode_labelled(outputs: Outputs, _: tuple[int, int], people: Sequence[int]) -> People:
     """Return people from rows of corners and score, then a label there or in another output."""
     found = outputs[0]
@@ -380,7 +376,9 @@ FORMS: Final[Mapping[str, Form]] = {
         *(_decode_with_object, _count_with_object),
     ),
     "yolov8": Form(
-        "(4 + classes, cells); also later ones; takes RGB 0..1", _decode_columns, _count_columns
+        "(4 + classes, cells); also later ones; takes RGB 0..1",
+        lambda outputs, _, people: decode_grid(outputs[0].T, people, with_object=False),
+        _count_columns,
     ),
     "yolo-nms": Form("(boxes, 6): corners, score, label; takes RGB 0..1", _decode_labelled),
     "detr": Form(

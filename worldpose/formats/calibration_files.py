@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
@@ -121,11 +121,11 @@ def camera_id(name: str) -> str:
 def known_id(name: str, known: Collection[str]) -> str:
     """Return the id among `known` of a camera of a name, or else the name's own id.
 
-    Some programs write underscores for spaces, for which ids have hyphens.
+    Some programs change capitals, or write underscores for spaces, where ids have hyphens.
     """
-    own = camera_id(name)
-    alike = [each for each in known if each.replace("_", "-") == own.replace("_", "-")]
-    return name if name in known else alike[0] if len(alike) == 1 else own
+    own = camera_id(name).replace("_", "-").lower()
+    alike = [each for each in known if each.replace("_", "-").lower() == own]
+    return name if name in known else alike[0] if len(alike) == 1 else camera_id(name)
 
 
 def index_by_name(
@@ -194,22 +194,23 @@ def read_calibration_toml(
 
 def _with_size(table: Mapping[str, Any], size: tuple[int, int] | None) -> Mapping[str, Any]:
     """Return a camera's table, with the video's size if its own is near that, but not whole."""
-    given = _plain_numbers(table.get("size"))
+    given = plain_numbers(table.get("size"))
     if size is None or given is None or given.shape != (2,) or np.all(given == np.round(given)):
         return table
     near = np.all(np.abs(given / np.array(size) - 1.0) < 0.05)
     return {**table, "size": list(size)} if near else table
 
 
-def _has_lens_alone(table: Mapping[str, Any]) -> bool:
+def _has_lens_alone(table: Mapping[str, Any], lacks: Callable[[list[bool]], bool] = all) -> bool:
+    """Return whether a camera has a lens but no pose, or not `all` or `any` of its two parts."""
     pose = [table.get(key) for key in ("rotation", "translation")]
-    return "matrix" in table and all(each in (None, "null", "None", "", []) for each in pose)
+    return "matrix" in table and lacks([each in (None, "null", "None", "", []) for each in pose])
 
 
 def _lacks_pose(table: Mapping[str, Any]) -> bool:
-    """Return whether a camera has a lens but no pose, an empty one, or one with NaN."""
+    """Return whether a camera has a lens but half a pose at most, or one with NaN."""
     pose = repr([table.get(key) for key in ("rotation", "translation")])
-    return _has_lens_alone(table) or ("matrix" in table and "nan" in pose)
+    return _has_lens_alone(table, any) or ("matrix" in table and "nan" in pose)
 
 
 def camera_tables(
@@ -397,8 +398,9 @@ def _read_numbers(
     """Return entry `key` as float64; column and row vectors become flat."""
     if key not in table:
         todo = "Calibrate this camera, or take it out of the file."
-        raise InputError(f"{where}.{key}", "a value", "nothing", todo)
-    numbers = _plain_numbers(table[key])
+        found = f"nothing; there are {', '.join(map(str, table)):.100}"
+        raise InputError(f"{where}.{key}", "a value", found, todo)
+    numbers = plain_numbers(table[key])
     if numbers is None:
         raise calibration_error(f"{where}.{key}", "numbers", describe_value(table[key]))
     if shape is not None and len(shape) == 1 and numbers.size == shape[0]:
@@ -414,7 +416,7 @@ def _read_numbers(
     return numbers
 
 
-def _plain_numbers(value: object) -> NDArray[np.float64] | None:
+def plain_numbers(value: object) -> NDArray[np.float64] | None:
     """Return a list, or list of lists, of numbers as an array; None for anything else."""
     rows = value if isinstance(value, list) else [value]
     flat = [x for row in rows for x in (row if isinstance(row, list) else [row])]

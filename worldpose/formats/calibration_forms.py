@@ -147,6 +147,7 @@ def find_calibration(folder: Path) -> tuple[Form, tuple[Path, ...]]:
     found = calibrations_in(folder)
     if len(found) == 1:
         return found[0]
+    others = ", ".join(sorted(each.name for each in folder.iterdir()))
     listed = "; ".join(
         f"{files[0].name}{f' and {len(files) - 1} more' if len(files) > 1 else ''} ({form.name})"
         for form, files in found
@@ -154,7 +155,7 @@ def find_calibration(folder: Path) -> tuple[Form, tuple[Path, ...]]:
     raise InputError(
         str(folder),
         expected="one calibration: " + _list_forms(),
-        found=listed or "none",
+        found=listed or f"none{others and f'; there are {others:.100}'}",
         todo="Give the file that is meant, or move the others elsewhere."
         if found
         else "Export the calibration in one of these forms.",
@@ -321,6 +322,8 @@ def _read_easymocap(
     posed = [name for name in names if f"T_{name}" in poses]
     if left_out is not None and posed:
         left_out.update({camera_id(name): "it has no pose" for name in names if name not in posed})
+        lost = [key[2:] for key in poses if key[:2] == "T_" and key[2:] not in names]
+        left_out.update({camera_id(name): f"{lens_file.name} has no lens of it" for name in lost})
         names = posed
     cameras = []
     for name in names:

@@ -21,12 +21,13 @@ from worldpose.formats.calibration_files import (
     camera_id,
     index_by_name,
     known_id,
+    plain_numbers,
     read_camera_table,
 )
 from worldpose.formats.calibration_unit import require_middle
 from worldpose.formats.files import SETTINGS_BYTES, read_json, read_yaml
 from worldpose.formats.lens_files import kalibr_tables
-from worldpose.formats.opencv_storage import read_file_storage
+from worldpose.formats.opencv_storage import is_storage, read_file_storage
 
 _JSON_BYTES: Final = 16 * SETTINGS_BYTES
 _CENTIMETRE: Final = 1e-2
@@ -53,7 +54,9 @@ def read_camera_json(path: Path, left_out: LeftOut | None) -> dict[str, CameraCa
     raise calibration_error(
         f"{path}: cameras",
         "Panoptic Studio's list of cameras, multical's mapping, or K, R and t of each camera",
-        "nothing" if cameras is None else f"{cameras!r:.60}",
+        f"nothing; there are {', '.join(content):.80}"
+        if isinstance(content, dict) and cameras is None
+        else f"{cameras or content!r:.60}",
     )
 
 
@@ -93,10 +96,8 @@ def _panoptic_lack(table: Mapping[str, Any]) -> str:
     """Return why a camera is left out; empty if it is not."""
     if not table.get("R") and not table.get("t"):
         return "it has no pose"
-    try:
-        is_skew = abs(float(table["K"][0][1])) > 1e-9
-    except (TypeError, ValueError, IndexError, KeyError):
-        return ""  # the reader names the fault
+    matrix = plain_numbers(table.get("K"))  # the reader names its faults
+    is_skew = matrix is not None and matrix.shape == (3, 3) and abs(matrix[0, 1]) > 1e-9
     return "its pixels are skew (K[0][1]), which no lens model has" if is_skew else ""
 
 
@@ -149,6 +150,10 @@ def _read_multical(
 
 def read_kalibr(path: Path, left_out: LeftOut | None) -> dict[str, CameraCalibration]:
     """Return the cameras of a Kalibr camchain, in the world of its first one [m]; or InputError."""
+    if is_storage(path):
+        expected = "a camchain of Kalibr, or intri.yml with extri.yml of EasyMocap"
+        todo = "Import the lenses with worldpose import --lens FILE, or write TOML of all cameras."
+        raise InputError(str(path), expected, "another file of OpenCV's FileStorage", todo)
     tables = dict(kalibr_tables(path, read_yaml(path), posed=True))
     return _read_tables(path, tables, Keys(), left_out)
 

@@ -75,10 +75,7 @@ def _child(where: str, element: ET.Element, tag: str) -> ET.Element:
 
 def _numbers(where: str, element: ET.Element, keys: Sequence[str]) -> NDArray[np.float64]:
     """Return attributes of one number each."""
-    values = [element.get(key) for key in keys]
-    return np.concatenate(
-        [_parse(f"{where}.{key}", text, 1) for key, text in zip(keys, values, strict=True)]
-    )
+    return np.concatenate([_parse(f"{where}.{key}", element.get(key), 1) for key in keys])
 
 
 def _parse(where: str, text: str | None, count: int) -> NDArray[np.float64]:
@@ -111,7 +108,7 @@ def _read_qualisys(
     if left_out is not None and active:
         gone = [each for each in every if each not in active]
         left_out.update({element.get("serial", where): "it is inactive" for where, element in gone})
-    has_video = any("video" in element.get("model", "").lower() for _, element in active)
+    has_video = any(re.search("video|hybrid", each.get("model", "").lower()) for _, each in active)
     has_fov = any(element.find("fov_video") is not None for _, element in active)
     lacks = [_qualisys_lack(element, has_video, has_fov) for _, element in active]
     if left_out is not None and not all(lacks):
@@ -126,7 +123,7 @@ def _read_qualisys(
 def _qualisys_lack(element: ET.Element, has_video: bool, has_fov: bool) -> str:
     """Return why a camera makes no calibrated video; empty if it does."""
     model = element.get("model", "")
-    if has_video and "video" not in model.lower():
+    if has_video and not re.search("video|hybrid", model.lower()):
         return f"it records markers ({model})"
     if has_fov and element.find("fov_video") is None:
         return "it makes no video (no fov_video)"

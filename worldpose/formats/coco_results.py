@@ -339,10 +339,9 @@ def _find_error(
     what = f"{width} numbers: {expected}" if key == "keypoints" else f"{width} numbers"
     todo = _COUNT_TODO if key == "keypoints" else "Correct the file."
     for index, row in zip(indices, rows, strict=True):
-        if type(row) is not list:
-            return _result_error(path, index, key, what, describe_value(row), todo)
-        if len(row) != width:
-            return _result_error(path, index, key, what, f"{len(row)}", todo)
+        if type(row) is not list or len(row) != width:
+            found = f"{len(row)}" if type(row) is list else describe_value(row)
+            return _result_error(path, index, key, what, found, todo)
         for place, number in enumerate(row):
             fits = type(number) in (float, NoneType)
             fits |= type(number) is int and number.bit_length() < 1024

@@ -89,14 +89,12 @@ def _read_value(where: str, value: Any) -> Any:  # noqa: ANN401
     """Return a matrix, number, text or list of texts; None for another mapping."""
     if isinstance(value, dict):
         return _read_matrix(where, value) if "data" in value else None
+    plain = str | int | float
     if isinstance(value, list):
-        return [each if isinstance(each, str) else f"{each:g}" for each in value if _is_plain(each)]
+        given = [each for each in value if isinstance(each, plain)]
+        return [each if isinstance(each, str) else f"{each:g}" for each in given]
     is_number = not isinstance(value, str) or re.fullmatch(r"[-+]?\d+[eE][-+]?\d+", value)
-    return float(value) if is_number and _is_plain(value) else value
-
-
-def _is_plain(value: object) -> bool:
-    return isinstance(value, str | int | float)
+    return float(value) if is_number and isinstance(value, plain) else value
 
 
 def _read_matrix(where: str, table: dict[str, Any]) -> NDArray[np.float64]:

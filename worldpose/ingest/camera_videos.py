@@ -43,7 +43,7 @@ def find_videos(
     videos = _films_in(folder)
     groups = [[file] for file in videos] if named else _recordings(videos)
     for place in (each for each in sorted(folder.glob("[!.]*")) if each.is_dir()):
-        inside = [[place]] if _has_images(place) else _recordings_in(place)
+        inside = [[place]] if _has_images(place) else _recordings(_films_in(place))
         groups += [group for group in inside if len(group) > 1 or len(inside) == 1]
     found: dict[str, Path] = {}
     first: dict[str, Path] = {}
@@ -89,10 +89,6 @@ def _films_in(folder: Path) -> list[Path]:
     return [file for file in files if file.is_file() and holds_video(file)]
 
 
-def _recordings_in(place: Path) -> list[list[Path]]:
-    return _recordings(_films_in(place))
-
-
 def describe_unused(folder: Path, used: Collection[Path]) -> list[str]:
     """Return sentences about files and videos in a folder that are of no camera."""
     others: list[str] = []
@@ -104,7 +100,7 @@ def describe_unused(folder: Path, used: Collection[Path]) -> list[str]:
             others.append(place.name)
         elif place.is_dir() and _has_images(place):
             inner += [each for each in place.glob("[!.]*") if each.suffix.lower() not in SUFFIXES]
-        elif place.is_dir() and len(groups := _recordings_in(place)) > 1:
+        elif place.is_dir() and len(groups := _recordings(_films_in(place))) > 1:
             inner += [group[0] for group in groups if len(group) == 1]
         elif place.is_dir() and [*map(len, groups)] == [1] and groups[0][0] not in used:
             strays += groups[0]
@@ -297,7 +293,10 @@ def fit_to_video(
     if (shown / own).max() > (1.0 + same_shape) * scale:
         with open_video(file, index) as video:
             if not _has_black_bars(video.frame(0), bar):
-                raise video_size_error(file, camera, index)
+                expected = "{} x {} px, the size in the calibration".format(*camera.image_size)
+                todo = "Give the video that was calibrated, in its size: a crop has another "
+                todo += "principal point, and a turned one another calibration."
+                raise InputError(str(file), expected, "{} x {}".format(*index.size), todo)
     notes.append(
         f"{file.name}: {index.size[0]} x {index.size[1]} px, calibrated are {{}} x {{}}: ".format(
             *camera.image_size
@@ -321,10 +320,3 @@ def _has_black_bars(frame: Image, bar: NDArray[np.float64]) -> bool:
     # The line next to a bar with a fraction is a mixture.
     next_lines = [lines[width + 2], lines[-width - 3]]
     return width > 0 and bool(black.max() < max_black and min(next_lines) > max_black)
-
-
-def video_size_error(file: Path, camera: CameraCalibration, index: FrameIndex) -> InputError:
-    """Return the error of a video that has not the size of its calibration."""
-    expected = "{} x {} px, the size in the calibration".format(*camera.image_size)
-    todo = "Give the video that was calibrated, in its size: a crop has another principal point."
-    return InputError(str(file), expected, f"{index.size[0]} x {index.size[1]}", todo)

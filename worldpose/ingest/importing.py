@@ -38,7 +38,7 @@ from worldpose.ingest.registration import file_state, require_settled
 from worldpose.ingest.validation import validate_record
 from worldpose.ingest.writing import copy_boxes, write_match
 from worldpose.video.folder import index_video
-from worldpose.video.names import VIDEO_SUFFIXES
+from worldpose.video.names import VIDEO_SUFFIXES, is_video
 from worldpose.video.pictures import FrameIndex
 
 Placing: TypeAlias = Callable[
@@ -115,7 +115,9 @@ def as_cameras(
 
 def camera_of(place: Path) -> str:
     """Return the camera of a video, of a file of 2D poses, or of a folder `<camera>_json`."""
-    return camera_id(place.stem.removesuffix("_json"))
+    name = place.stem if place.is_file() else place.name
+    name = name.removesuffix("_json")
+    return camera_id(Path(name).stem if is_video(name) else name)
 
 
 _CHANGES: Final = {
@@ -257,8 +259,8 @@ def pick_cameras(
     if len(both) < max(1, min(2, len(cameras))):
         there = files.values() or sorted(folder.glob("[!.]*"))
         expected = f"one file ({', '.join(suffixes)}) for each camera in {calibration.name}: "
-        found_names = ", ".join(file.name for file in there) or "no such file"
-        todo = "Rename the files as the cameras."
+        found_names = ", ".join(f.name + "/" * f.is_dir() for f in there) or "no such file"
+        todo = "Name them as the cameras, with a folder's files directly in it."
         raise InputError(str(folder), expected + ", ".join(cameras), found_names, todo)
     left_out.update({name: f"{folder} has no file of it" for name in cameras if name not in files})
     if others := [file.name for name, file in files.items() if name not in both]:

@@ -4,6 +4,7 @@ import tomllib
 import cv2
 import numpy as np
 import pytest
+from calibration_writers import matrix
 
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import LeftOut
@@ -115,6 +116,13 @@ def test_caliscope_camera_is_called_by_its_number_and_may_give_a_matrix(read):
     assert camera.translation == (0.1, 0.2, 3.0)
 
 
+def test_half_a_pose_is_none(tmp_path):
+    half = CALISCOPE.replace("cameras.3", "cameras.4").replace("[[0.1], [0.2], [3.0]]", "[]")
+    (tmp_path / "c.toml").write_text(CALISCOPE + half)
+    assert [*read_calibration(tmp_path / "c.toml", left_out=(left_out := LeftOut()))] == ["cam_3"]
+    assert left_out == {"cam_4": "it has no pose"}
+
+
 @pytest.mark.parametrize(
     ("old", "new", "place", "words"),
     [
@@ -153,6 +161,8 @@ def test_no_camera_two_of_one_name_and_other_kinds_of_file_are_refused(refusal):
     twice = ANIPOSE + ANIPOSE.replace("[cam_0]", "[cam_1]").split("[metadata]")[0]
     assert "'left' a second time" in refusal(twice).found
     assert "a camchain of Kalibr" in refusal("a: 1", "calibration.yaml").expected
+    assert "FileStorage" in refusal("K: !!opencv-matrix", "calibration.yaml").found
+    assert refusal('{"unit": "mm"}', "calibration.json").found == "nothing; there are unit"
     assert "'.ini'" in refusal("", "calibration.ini").found
 
 
@@ -193,18 +203,13 @@ def test_qualisys_camera_projects_as_it_stands(read):
 
     def pixel(point):
         return cv2.projectPoints(
-            np.array([point]), cv2.Rodrigues(rotation)[0], t, _matrix(camera), None
+            np.array([point]), cv2.Rodrigues(rotation)[0], t, matrix(camera), None
         )[0].ravel()
 
     # 1 m at 10 m distance is a tenth of the focal length; world y is up in the image.
     np.testing.assert_allclose(pixel([1.0, 2.0, 0.0]), [960, 540], atol=1e-9)
     np.testing.assert_allclose(pixel([2.0, 2.0, 0.0]), [1060, 540], atol=1e-9)
     np.testing.assert_allclose(pixel([1.0, 3.0, 0.0]), [960, 430], atol=1e-9)
-
-
-def _matrix(camera):
-    (fx, fy), (cx, cy) = camera.focal_px, camera.principal_point_px
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
 def test_qualisys_numbers_may_have_decimal_commas(read):
@@ -217,9 +222,10 @@ def test_qualisys_numbers_may_have_decimal_commas(read):
 def test_qualisys_cameras_that_are_off_are_left_out_by_name(tmp_path, word):
     begin, one, end = re.split(r"(<camera active=\"1\".*?</camera>)", QUALISYS, flags=re.S)
     two = re.sub('active="1"', word, one).replace("26580", "7")
-    (tmp_path / "rig.qca.txt").write_text(begin + one + two + end)
+    hybrid = one.replace("26580", "8").replace("Video", "Hybrid").replace("1000", "3000")
+    (tmp_path / "rig.qca.txt").write_text(begin + one + two + hybrid + end)
     left_out = LeftOut()
-    assert [*read_calibration(tmp_path / "rig.qca.txt", left_out=left_out)] == ["26580"]
+    assert [*read_calibration(tmp_path / "rig.qca.txt", left_out=left_out)] == ["26580", "8"]
     assert left_out.keys() == {"7", "1"}
 
 

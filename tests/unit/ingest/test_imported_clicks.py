@@ -159,7 +159,9 @@ def test_the_short_export_of_label_studio_gives_the_same_clicks(tmp_path):
     file = label_studio(tmp_path / "clicks", [*CLICKS.items()])
     (task,) = json.loads(file.read_text())
     given = task["annotations"][0]["result"][1:]
-    short = {"image": "east.png", "id": 1, "kp": [each["value"] | SIDES for each in given]}
+    values = [each["value"] | SIDES for each in given]
+    turned = [v | {"x": 100 - v["x"], "y": 100 - v["y"], "image_rotation": 180} for v in values]
+    short = {"image": "east.png", "id": 1, "kp": turned}
     for number, each in enumerate(([short], task)):  # and a task alone, as from the API
         file.write_text(json.dumps(each))
         import_clicks(file, match(tmp_path / f"m{number}"))
@@ -171,7 +173,7 @@ def test_the_short_export_of_label_studio_gives_the_same_clicks(tmp_path):
 def test_lines_of_soccernet_are_clicks_in_its_json_and_by_its_names(tmp_path):
     shares = [{"x": x / SIZE[0], "y": y / SIZE[1]} for x, y in LINE]
     outside = [{"x": 1.2, "y": 0.5}]
-    names = {"Side line bottom": shares + outside, "Goal left post left ": shares}
+    names = {"Side LINE bottom": shares + outside, "goal left post left ": shares}
     (tmp_path / "00012.json").write_text(json.dumps({**names, "Line unknown": shares}))
     import_clicks(tmp_path / "00012.json", match(tmp_path / "m"), "east")
     _, drawn = clicked(tmp_path / "m")

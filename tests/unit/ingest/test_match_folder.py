@@ -311,7 +311,7 @@ def test_data_of_unknown_cameras_are_refused(tmp_path, one, make_people, make_ca
 
 def test_clock_offsets_are_written_into_match_yaml_and_all_else_stays(tmp_path):
     file = tmp_path / "match.yaml"
-    file.write_text(
+    text = (
         "match_id: m  # the final\n"
         "fps: 25\n"
         "cameras:\n"
@@ -324,21 +324,12 @@ def test_clock_offsets_are_written_into_match_yaml_and_all_else_stays(tmp_path):
         "clips:\n"
         "  - {id: clip, frame_count: 3}\n"
     )
+    file.write_text(text)
     write_offsets(tmp_path, {"a": -12, "b": 2, "c": 7})
-    assert file.read_text() == (
-        "match_id: m  # the final\n"
-        "fps: 25\n"
-        "cameras:\n"
-        "  - {id: a, width: 64, height: 48, offset_frames: -12}   # late\n"
-        "  - {id: b, offset_frames: 2, width: 64, height: 48}\n"
-        "  - id: c\n"
-        "    offset_frames: 7\n"
-        "    width: 64   # small\n"
-        "    height: 48\n"
-        "  - {id: d, width: 64, height: 48, offset_frames: 1}\n"
-        "clips:\n"
-        "  - {id: clip, frame_count: 3}\n"
-    )
+    more = {"frames: 3": "frames: -12", "b,": "b, offset_frames: 2,"}
+    for old, new in {**more, "id: c\n": "id: c\n    offset_frames: 7\n"}.items():
+        text = text.replace(old, new)
+    assert file.read_text() == text
     with pytest.raises(InputError, match=r"match.yaml: expected the cameras z, found others"):
         write_offsets(tmp_path, {"z": 1})
     assert "offset_frames: 7" in file.read_text()

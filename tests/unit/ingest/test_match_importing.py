@@ -264,13 +264,13 @@ def test_a_short_video_does_not_shorten_the_match(tmp_path, make_camera):
 def test_easymocap_takes_the_size_of_the_videos_and_leaves_out_what_has_no_pose(
     tmp_path, make_camera
 ):
-    names = ["one", "two", "three"]
+    names = ["one", "two", "three", "four"]
     cameras = read_calibration(calibrate(tmp_path, make_camera, names))
     folder = tmp_path / "easymocap"
     folder.mkdir()
     write_easymocap(folder, list(cameras.values()))
     lens, pose = folder / "intri.yml", folder / "extri.yml"
-    lens.write_text("".join(re.findall(r"^(?![WH]_).*\n", lens.read_text(), re.MULTILINE)))
+    lens.write_text(re.sub(r"^[WH]_.*\n| +- .?four.?\n", "", lens.read_text(), flags=re.M))
     pose.write_text(
         re.sub(r"(R|Rot|T)_three: .*?(?=^\S|\Z)", "", pose.read_text(), flags=re.M | re.S)
     )
@@ -280,7 +280,10 @@ def test_easymocap_takes_the_size_of_the_videos_and_leaves_out_what_has_no_pose(
         film(tmp_path / "videos" / f"{name}.mp4")
     spec, notes = import_videos(folder, tmp_path / "videos", tmp_path / "m")
     assert [(camera.id, camera.width) for camera in spec.cameras] == [("one", 64), ("two", 64)]
-    assert notes == ["camera three is left out: it has no pose"]
+    assert notes == [
+        "camera three is left out: it has no pose",
+        "camera four is left out: intri.yml has no lens of it",
+    ]
 
 
 SPEC = match_spec(["cam"])

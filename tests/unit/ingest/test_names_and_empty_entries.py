@@ -18,7 +18,7 @@ from worldpose.formats.coco_results import BATCH, read_coco_results
 from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.ingest.camera_videos import describe_unused, find_videos
 from worldpose.ingest.clicks import import_clicks
-from worldpose.ingest.importing import import_match, import_videos
+from worldpose.ingest.importing import camera_of, import_match, import_videos
 from worldpose.ingest.match_folder import read_match
 from worldpose.parsing import read_cells
 from worldpose.video.files import VideoReader, holds_video
@@ -86,14 +86,16 @@ def test_an_escaped_space_is_no_digit_of_a_frame():
     assert frame_numbers(["a%2012.jpg", "a%2013.jpg"]) == {"a%2012.jpg": 12, "a%2013.jpg": 13}
 
 
-def test_poses_and_videos_are_of_cameras_with_hyphens_for_underscores(tmp_path, make_camera):
+def test_poses_and_videos_are_of_cameras_with_hyphens_or_capitals(tmp_path, make_camera):
+    folders = map(tmp_path.joinpath, ("cam.1_json", "GX010001.MP4_json"))
+    assert [*map(camera_of, folders)] == ["cam.1", "GX010001"]
     names = ["cam_2", "cam_1"]  # not in the order of their numbers
     cameras = {name: make_camera(name, 0.1 * n + 0.1) for n, name in enumerate(names)}
     write_calibration_toml(tmp_path / "calibration.toml", cameras)
     (tmp_path / "poses").mkdir()
     for n in (1, 2):
         person = [{"image_id": n, "keypoints": POINTS}]
-        (tmp_path / "poses" / f"cam-{n}.json").write_text(json.dumps(person))
+        (tmp_path / "poses" / f"CAM-{n}.json").write_text(json.dumps(person))
     import_match(tmp_path / "calibration.toml", tmp_path / "poses", 25.0, tmp_path / "m")
     given = read_match(tmp_path / "m").detections
     assert {*given} == {*names}
@@ -103,7 +105,7 @@ def test_poses_and_videos_are_of_cameras_with_hyphens_for_underscores(tmp_path, 
         "cam_2": [False, True],
     }
     (tmp_path / "poses" / "cam_1.json").write_text("[]")
-    with pytest.raises(InputError, match=r"one file of cam_1, found cam-1\.json and cam_1\.json"):
+    with pytest.raises(InputError, match=r"one file of cam_1, found CAM-1\.json and cam_1\.json"):
         import_match(tmp_path / "calibration.toml", tmp_path / "poses", 25.0, tmp_path / "n")
 
 

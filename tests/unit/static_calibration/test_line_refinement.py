@@ -174,10 +174,6 @@ def paint(image, places, strength=0.45):
     return image + (230.0 - image) * strength * (cover[..., None] / 255.0)
 
 
-def as_picture(image):
-    return np.clip(np.round(image), 0, 255).astype(np.uint8)
-
-
 def projected():
     x = np.linspace(20.0, 1900.0, 200)
     return np.stack([x, 200.0 - 0.03 * x], axis=1)
@@ -196,7 +192,7 @@ def test_thin_paint_beside_its_projection_is_traced_despite_letters():
     for x in range(900, 1500, 14):  # letters behind the line
         y = 200.0 - 0.03 * x - 4.0 + rng.uniform(-2.0, 2.0)
         cv2.rectangle(image, (x, int(y)), (x + 9, int(y) + 2), (220.0, 220.0, 220.0), -1)
-    found = trace_marking(as_picture(image), projected())
+    found = trace_marking(np.clip(np.round(image), 0, 255).astype(np.uint8), projected())
     assert len(found) > 150
     expected = np.interp(found[:, 0], *true_places().T)
     assert np.abs(np.median(found[:, 1] - expected)) < 0.15
@@ -204,10 +200,6 @@ def test_thin_paint_beside_its_projection_is_traced_despite_letters():
 
 
 CIRCLE_SIZE = (1280, 720)
-
-
-def circle_camera(aim, focal, center=(-2.0, -66.0, 15.0)):
-    return pinhole(center, (*aim, 0.0), focal, CIRCLE_SIZE)
 
 
 def farthest(found, true, names):
@@ -227,7 +219,7 @@ def farthest(found, true, names):
 
 @pytest.mark.slow
 def test_a_midfield_still_is_calibrated_on_the_stated_side():
-    true = circle_camera((0.0, 1.0), 2300.0)
+    true = pinhole((-2.0, -66.0, 15.0), (0.0, 1.0, 0.0), 2300.0, CIRCLE_SIZE)
     still = render_pitch(true, PITCH, None, 5)
     proposal = propose_camera(still, PITCH, side="far")
     found = calibrate_proposal(PITCH, proposal, still).estimate.camera

@@ -111,7 +111,8 @@ def test_arrays_of_any_order_in_memory_go_to_the_kernels_in_rows(clip):
 
 def test_points_are_found_within_their_noise(clip):
     cameras, _, with_feet, truth = clip
-    found = triangulate_joints(cameras, with_feet, replace_settings(offsets="none")).extra
+    settings = TriangulationSettings(offsets="none")
+    found = triangulate_joints(cameras, with_feet, settings).extra
     assert found.points == FEET and found.joints.shape == truth.shape
     away = found.joints - truth
     # 30 m away at 1500 px, 2 px are 40 mm across one ray; six views leave half of that.
@@ -122,10 +123,6 @@ def test_points_are_found_within_their_noise(clip):
     square = np.einsum("fpka,fpkab,fpkb->fpk", away, np.linalg.inv(random), away)
     assert 2.4 < square.mean() < 3.6  # chi-square of three degrees of freedom
     assert (found.views >= 5).mean() > 0.95
-
-
-def replace_settings(**changes):
-    return TriangulationSettings().model_copy(update=changes)
 
 
 as_detections = KeypointDetections.from_keypoints

@@ -275,6 +275,7 @@ def _full_task(task: Any) -> Any:  # noqa: ANN401
             "type": kind,
             "original_width": each.get("original_width"),
             "original_height": each.get("original_height"),
+            "image_rotation": each.get("image_rotation", 0),
             "value": each,
         }
         for entry in task.values()
@@ -308,7 +309,8 @@ class _Dataset(Given):
 
 def _read_coco(content: bytes) -> Iterator[MarkedImage]:
     given = json.loads(content)
-    if isinstance(given, dict) and SOCCERNET_MARKINGS.keys() & {name.strip() for name in given}:
+    theirs = {*map(str.lower, SOCCERNET_MARKINGS)}
+    if isinstance(given, dict) and theirs & {name.strip().lower() for name in given}:
         yield _read_soccernet("", given)  # a number may name its file
         return
     # A task of Label Studio alone; data sets may have more keys.

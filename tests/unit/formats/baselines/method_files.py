@@ -217,10 +217,6 @@ def write_slahmr(folder, bodies, camera, phase="motion_chunks"):
     return folder
 
 
-def write_slahmr_smooth(folder, bodies, camera):
-    return write_slahmr(folder, bodies, camera, "smooth_fit")
-
-
 def write_wham(folder, bodies, camera):
     import joblib
 
@@ -338,7 +334,7 @@ WRITERS = {
     "glamr": write_glamr,
     "slahmr": write_slahmr,
     "slahmr-true-cameras": write_slahmr,
-    "slahmr-no-humor": write_slahmr_smooth,
+    "slahmr-no-humor": lambda *given: write_slahmr(*given, "smooth_fit"),
     "wham": write_wham,
     "gvhmr": write_gvhmr,
     "tram": write_tram,
