@@ -150,16 +150,6 @@ def test_regions_of_the_true_size_hold_the_stated_share(level):
     assert (count, inside / count) == (60 * 4 * 17, pytest.approx(level, abs=0.02))
 
 
-def test_missing_joints_frames_and_unseen_joints_do_not_count():
-    prediction, truth = people(frames=4, persons=2)
-    prediction.joints[0, 0, 0] = np.nan
-    views = np.full(truth.joints.shape[:3], 3)
-    views[1, 1, 1] = 1
-    three = {name: getattr(prediction, name)[:3] for name in ("frames", "joints", "covariance")}
-    counts = region_counts(replace(prediction, **three), replace(truth, views=views))
-    assert sum(total for _, total in counts.values()) == 3 * 2 * 17 - 2
-
-
 def scores(distances, gate=1.0):
     """Scores where infinite distances to all others mean that a person is absent."""
     distances = np.array(distances, dtype=np.float64)
