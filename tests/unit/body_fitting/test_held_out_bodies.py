@@ -123,18 +123,13 @@ def test_one_call_places_bodies_better_than_triangulation(known):
     assert errors[2] < 0.02
 
 
-def test_one_call_takes_rows_for_frames_where_no_numbers_are_given():
-    seen = filmed(ring(3), 1.5, 7, people=1, frames=12)
-    found = reconstruct_bodies(list(ring(3)), seen, 50.0)
-    assert found.tracks.frames.tolist() == list(range(12))
-
-
-def test_every_second_frame_is_half_the_frame_rate():
+def test_every_second_frame_is_half_the_frame_rate_and_rows_are_frames_without_numbers():
     seen = filmed(ring(3), 1.5, 7, people=1, frames=24)
     every = replace(seen, frame=np.arange(24))[np.arange(0, 24, 2)]
-    rows = replace(every, frame=np.arange(12))
+    rows = replace(every, frame=every.frame[:0])
     one, other = (reconstruct_bodies(ring(3), *given) for given in ((every, 50.0), (rows, 25.0)))
     assert one.frame.tolist() == list(range(0, 24, 2))
+    assert other.tracks.frames.tolist() == list(range(12))
     np.testing.assert_array_equal(one.bodies.joints, other.bodies.joints)
 
 
@@ -144,7 +139,6 @@ def test_every_second_frame_is_half_the_frame_rate():
         (4, [0, 1, 2], 50.0, "cameras .cameras,. of 2 or more"),
         (3, [0, 1], 50.0, "found .2,. int64. Give each row the number"),
         (3, [0.0, 0.5, 1.0], 50.0, "expected 3 whole numbers, one for each row, or none, found"),
-        (3, [2, 1, 0], 50.0, "found numbers that repeat or fall"),
         (3, [0, 0, 1], 50.0, "found numbers that repeat or fall"),
         (3, [0, 40, 10**9], 50.0, "at most 200000 from first to last"),
         (3, [0, 1, 2], 0.0, "frames per second, above 0"),
@@ -157,24 +151,16 @@ def test_one_call_refuses_what_it_cannot_place(cameras, frame, fps, words):
         reconstruct_bodies(ring(cameras), seen, fps)
 
 
-def test_one_call_refuses_no_detections():
-    with pytest.raises(InputError, match="of 2 or more"):
-        reconstruct_bodies(ring(3), [], 50.0)
-
-
-@pytest.mark.parametrize(("points", "sure"), [(25, 25), (13, 13), (17, 16)])
+@pytest.mark.parametrize(("points", "sure"), [(25, 25), (17, 16)])
 def test_one_call_names_the_points_that_it_takes(points, sure):
     seen = KeypointDetections.from_keypoints(
         np.ones((2, 3, 1, points, 2)), np.ones((2, 3, 1, sure))
     )
-    each = [replace(seen, keypoints=seen.keypoints[:, 0], confidence=seen.confidence[:, 0])] * 3
-    for call in (
-        lambda: reconstruct_bodies(ring(3), seen, 50.0),
-        lambda: reconstruct_bodies(ring(3), each, 50.0),
-        lambda: track_people(ring(3), seen, 50.0),
-    ):
+    for call in (reconstruct_bodies, track_people):
         with pytest.raises(InputError, match=r"17, 2|joints, 2"):
-            call()
+            call(ring(3), seen, 50.0)
+    with pytest.raises(InputError, match="of 2 or more"):
+        reconstruct_bodies(ring(3), [], 50.0)
 
 
 def test_rows_without_numbers_keep_their_place_and_people():

@@ -207,7 +207,3 @@ def test_keypoints_are_hidden_by_a_nearer_person_and_classed_by_their_distance_f
     np.testing.assert_array_equal(found[1], alone)
     inside = (np.abs(far[:, 0] - 302.0) < 9.0) & (far[:, 1] > near[:, 1].min())
     np.testing.assert_array_equal(found[0], alone + CONDITIONS // 2 * inside)
-
-
-def test_without_people_there_are_no_conditions():
-    assert conditions(np.empty((4, 3, 0, 17, 2))).shape == (4, 3, 0, 17)

@@ -76,9 +76,7 @@ def clip(ring):
     cameras = ring(6)
     time = np.arange(60)[:, None, None, None] / FPS
     body = rng.uniform(-0.4, 0.4, (1, 2, 23, 3)) + [[[0.0, 0.0, 1.0]]]
-    places = (
-        body + np.array([0.0, 0.0, 0.0, 4.0]).reshape(1, 2, 1, 2)[..., :1] + time * [1.0, 0.5, 0.0]
-    )
+    places = body + time * [1.0, 0.5, 0.0]
     keypoints, confidence, index = seen(cameras, places)
     keypoints = keypoints + PIXEL_NOISE * rng.standard_normal(keypoints.shape)
     detections = KeypointDetections.from_keypoints(
@@ -99,19 +97,9 @@ def test_joints_are_bit_for_bit_those_without_points(clip):
     np.testing.assert_array_equal(one.smoothing.joints, two.smoothing.joints)
 
 
-def test_arrays_of_any_order_in_memory_go_to_the_kernels_in_rows(clip):
-    _, _, seen, _ = clip
-    given = np.asfortranarray(seen.keypoints), np.asfortranarray(seen.confidence)
-    found = as_detections(*given)
-    assert found.keypoints.flags.c_contiguous and found.confidence.flags.c_contiguous
-    observed = Observations.of(clip[0], given[0], given[1], seen.detection_index)
-    assert observed.keypoints.flags.c_contiguous
-    np.testing.assert_array_equal(observed.keypoints, seen.keypoints)
-
-
 def test_points_are_found_within_their_noise(clip):
     cameras, _, with_feet, truth = clip
-    found = triangulate_joints(cameras, with_feet, replace_settings(offsets="none")).extra
+    found = triangulate_joints(cameras, with_feet, TriangulationSettings(offsets="none")).extra
     assert found.points == FEET and found.joints.shape == truth.shape
     away = found.joints - truth
     # 30 m away at 1500 px, 2 px are 40 mm across one ray; six views leave half of that.
@@ -122,10 +110,6 @@ def test_points_are_found_within_their_noise(clip):
     square = np.einsum("fpka,fpkab,fpkb->fpk", away, np.linalg.inv(random), away)
     assert 2.4 < square.mean() < 3.6  # chi-square of three degrees of freedom
     assert (found.views >= 5).mean() > 0.95
-
-
-def replace_settings(**changes):
-    return TriangulationSettings().model_copy(update=changes)
 
 
 as_detections = KeypointDetections.from_keypoints
@@ -142,36 +126,28 @@ def some_joints(persons=2, count=17, frames=1):
     return rng.uniform([-4, -4, 0], [4, 4, 2], (frames, persons, count, 3))
 
 
-def test_one_view_determines_nothing(ring):
+def test_one_view_and_two_nearly_parallel_rays_determine_nothing(ring):
     keypoints, confidence, index = seen(ring(3), some_joints())
     index[:, 1:] = -1
     result = triangulate_joints(ring(3), as_detections(keypoints, confidence, index), SETTINGS)
-    assert np.isnan(result.joints).all()
-    assert np.isnan(result.covariance).all()
-    assert np.isnan(result.reprojection_error).all()
-    assert not result.views.any()
-    assert not result.inliers.any()
+    for found in (result.joints, result.covariance, result.reprojection_error):
+        assert np.isnan(found).all()
+    assert not result.views.any() and not result.inliers.any()
     assert result.report.undetermined == 34
-
-
-def test_two_nearly_parallel_rays_determine_nothing(ring):
     # Two cameras 0.06 rad apart on the ring, less than the 0.1 rad asked for.
     narrow = ring(2, arc=0.12)
-    result = triangulate_joints(narrow, as_detections(*seen(narrow, some_joints())), SETTINGS)
-    assert np.isnan(result.joints).all()
+    given = as_detections(*seen(narrow, some_joints()))
     wide = SETTINGS.model_copy(update={"min_angle_rad": 0.03})
-    assert np.isfinite(
-        triangulate_joints(narrow, as_detections(*seen(narrow, some_joints())), wide).joints
-    ).all()
+    for settings, known in ((SETTINGS, False), (wide, True)):
+        found = triangulate_joints(narrow, given, settings).joints
+        assert (np.isfinite(found) == known).all()
 
 
 def test_nan_keypoints_and_confidence_that_is_not_positive_are_left_out(ring):
     keypoints, confidence, index = seen(ring(5), some_joints())
     keypoints[:, 0] = np.nan
     keypoints[:, 1] += 50.0
-    confidence[:, 1] = 0.0
-    confidence[:, 2] = np.nan
-    confidence[:, 2, 0] = -0.5
+    confidence[:, 1], confidence[:, 2], confidence[:, 2, 0] = 0.0, np.nan, -0.5
     result = triangulate_joints(ring(5), as_detections(keypoints, confidence, index), SETTINGS)
     np.testing.assert_array_equal(result.views, 2)
     np.testing.assert_array_equal(result.inliers.any(axis=(0, 2, 3)), [0, 0, 0, 1, 1])
