@@ -33,15 +33,20 @@ ORDER_IN_WORLDPOSE = (
 
 
 @functools.cache
-def imported_modules(path):
+def imports(path):
+    """Return the modules (name, part) that a file imports, and what of them, "" = all."""
     found = []
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            found += [alias.name for alias in node.names]
+            found += [(alias.name, "") for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative imports hide the direction"
-            found.append(node.module)
+            found += [(node.module, alias.name) for alias in node.names]
     return found
+
+
+def imported_modules(path):
+    return list(dict.fromkeys(module for module, _ in imports(path)))
 
 
 def backward_imports(package, forbidden, root=ROOT):
@@ -133,15 +138,7 @@ def module_imports(root, packages):
         for package in packages
         for path in (root / package).rglob("*.py")
     }
-    taken = {
-        name: [
-            (node.module, alias.name) if isinstance(node, ast.ImportFrom) else (alias.name, "")
-            for node in ast.walk(ast.parse(path.read_text()))
-            if isinstance(node, ast.Import | ast.ImportFrom)
-            for alias in node.names
-        ]
-        for name, path in files.items()
-    }
+    taken = {name: imports(path) for name, path in files.items()}
 
     def definer(module, name, importer):
         if f"{module}.{name}" in files:

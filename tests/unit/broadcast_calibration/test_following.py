@@ -206,9 +206,7 @@ def test_the_offset_of_a_faster_camera_is_in_match_frames(rate, late):
     clock = ImageClock.of(frames, 0.0, rate, 0.0)
     camera, exact = people(late * rate, 5.0, rng)
     # What static cameras of this lower rate triangulate, with the noise of single frames.
-    joints = exact.joints[(frames * rate).astype(int)] if rate == 2.0 else None
-    if joints is None:
-        joints = rows_at(exact.joints, frames * rate)
+    joints = rows_at(exact.joints, frames * rate)
     joints = joints + 0.04 * rng.standard_normal(joints.shape)
     moving = People.in_images(joints, exact.keypoints[clock.number], FPS / rate, clock)
     images = np.arange(len(clock.images))
@@ -218,23 +216,18 @@ def test_the_offset_of_a_faster_camera_is_in_match_frames(rate, late):
     assert (found.frames, found.rate) == pytest.approx((late, rate), abs=0.15)
 
 
-def test_clips_that_agree_give_their_weighted_mean():
+def test_clips_that_agree_give_their_weighted_mean_and_those_of_two_places_none():
     wide, narrow = 4.0 * np.eye(3), np.eye(3)
-    pooled = pool_centers(
-        [np.array([0.0, -70.0, 15.0]), np.array([1.0, -70.0, 15.0])], [wide, narrow]
-    )
+    places = [np.array([x, -70.0, 15.0]) for x in (0.0, 1.0, 10.0)]
+    pooled = pool_centers(places[:2], [wide, narrow])
     assert pooled.agree
     # Weights of 1/4 and 1.
     np.testing.assert_allclose(pooled.center, [0.8, -70.0, 15.0])
     np.testing.assert_allclose(pooled.covariance, 0.8 * np.eye(3))
-
-
-def test_clips_of_two_places_are_not_pooled():
-    pooled = pool_centers([np.zeros(3), np.array([10.0, 0.0, 0.0])], [np.eye(3), np.eye(3)])
-    assert not pooled.agree
-    assert np.isnan(pooled.center).all()
+    apart = pool_centers(places[::2], [narrow, narrow])
+    assert not apart.agree and np.isnan(apart.center).all()
     # Half of ten to either side.
-    np.testing.assert_allclose(pooled.distance, [5.0, 5.0])
+    np.testing.assert_allclose(apart.distance, [5.0, 5.0])
 
 
 SMOOTH = np.array([np.inf] * 3 + [1e-4])

@@ -161,9 +161,7 @@ def picture(*people, name=f"pictures/{NAME}", size=(100, 50)):
 BEFORE = [picture(person(0), person(7))]
 
 
-@pytest.mark.parametrize(
-    "name", [f"pictures/{NAME}", NAME, f"/data/upload/3/f00-{NAME}", f"a\\{NAME}"]
-)
+@pytest.mark.parametrize("name", [NAME, f"/data/upload/3/f00-{NAME}", f"a\\{NAME}"])
 def test_what_only_was_rounded_is_no_change(name):
     back = [picture(person(7, 0.004), person(0, -0.004), name=name)]
     changes = find_changes(BEFORE, back, "file")
