@@ -61,7 +61,7 @@ def test_an_exact_survey_in_any_frame_gives_the_pitch_back(angle, slope):
     assert PitchTemplate.from_spec(fit.pitch).positions(NAMES) == pytest.approx(points(fit))
 
 
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(angle=st.floats(-np.pi, np.pi), seed=st.integers(0, 1000))
 def test_a_noisy_survey_keeps_its_own_distances(angle, seed):
     survey = surveyed(angle=angle, noise=0.02, seed=seed, shift=(10.0, -20.0, 3.0))

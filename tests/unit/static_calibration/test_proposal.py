@@ -93,13 +93,10 @@ def test_lines_that_many_cameras_explain_are_not_clear():
     proposal = propose_from_paint([paint_of(camera(), names)], PITCH, side="near")
     assert proposal is not None
     assert not proposal.is_clear
-    with pytest.raises(InputError) as refused:
+    told = rf"image of cam3.*nearly as well \(margin {proposal.margin:.0f}\).*Click four or more"
+    with pytest.raises(InputError, match=told) as refused:
         proposal.require_clear("image of cam3", PITCH)
-    message = str(refused.value)
-    assert "image of cam3" in message
-    assert f"another camera explains it nearly as well (margin {proposal.margin:.0f})" in message
-    assert "Click four or more named points" in message
-    named = message.rpartition("it sees ")[2].rstrip(".").split(", ")
+    named = str(refused.value).rpartition("it sees ")[2].rstrip(".").split(", ")
     assert 1 <= len(named) <= 4
     pixels = proposal.camera.project(PITCH.positions(named))
     assert ((pixels >= 0.0) & (pixels <= proposal.camera.image_size - 1.0)).all()
@@ -132,21 +129,16 @@ def test_markings_lie_on_paint_for_the_right_camera_alone(dark):
 
 SECONDS = np.arange(6.0)
 SEATS = {
-    "near": ((-20.0, -60.0, 18.0), (-25.0, 0.0, 0.0)),
-    "far": ((-30.0, 62.0, 16.0), (-25.0, 0.0, 0.0)),
-    "goal": ((-80.0, 5.0, 15.0), (-30.0, 0.0, 0.0)),
-    "other_end": ((78.0, -3.0, 25.0), (45.0, 0.0, 0.0)),
+    "near": pinhole((-20.0, -60.0, 18.0), (-25.0, 0.0, 0.0), 1100.0, (1920, 1080)),
+    "far": pinhole((-30.0, 62.0, 16.0), (-25.0, 0.0, 0.0), 1100.0, (1920, 1080)),
+    "goal": pinhole((-80.0, 5.0, 15.0), (-30.0, 0.0, 0.0), 1100.0, (1920, 1080)),
+    "other_end": pinhole((78.0, -3.0, 25.0), (45.0, 0.0, 0.0), 3000.0, (1920, 1080)),
 }
-
-
-def side_camera(seat):
-    center, aim = SEATS[seat]
-    return pinhole(center, aim, 3000.0 if seat == "other_end" else 1100.0, (1920, 1080))
 
 
 def watch(seat, places, rng, *, miss=0.2, false=1, noise=0.3):
     """Return what a camera sees of people (frames, people, 2), with misses and false positives."""
-    own = side_camera(seat)
+    own = SEATS[seat]
     stray = rng.uniform([-50.0, -32.0], [50.0, 32.0], (len(places), false, 2))
     xy = np.concatenate([places + rng.normal(0.0, noise, places.shape), stray], axis=1)
     ground = np.concatenate([xy, np.zeros((*xy.shape[:2], 1))], axis=-1)
