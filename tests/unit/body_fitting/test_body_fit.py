@@ -11,7 +11,6 @@ from data_contracts.conventions import FEET
 from data_contracts.keypoints import KeypointDetections
 from worldpose.body.jacobian import ChainedKeypoints
 from worldpose.body.keypoints import fold_keypoints
-from worldpose.body.model import BodyParameters
 from worldpose.body_fitting import estimate
 from worldpose.body_fitting.bones import Shape, agree, pool_shapes
 from worldpose.body_fitting.estimate import fit_bodies
@@ -131,9 +130,7 @@ def test_people_without_any_joint_and_clips_without_people_are_missing():
 def test_feet_stand_still_and_not_below_the_ground():
     rng = np.random.default_rng(13)
     stands = walker(1, rng)
-    stands = BodyParameters(
-        stands.betas, stands.global_orient, np.tile(stands.body_pose, (40, 1)), stands.transl
-    )
+    stands = replace(stands, body_pose=np.tile(stands.body_pose, (40, 1)))
     exact = KEYPOINTS(stands)
     sole = exact[0, 15:, 2].min() - 0.08
     joints, covariance = seen(stands, 0.02, rng)
@@ -215,22 +212,19 @@ def test_what_other_clips_know_of_a_person_counts():
     assert np.trace(known.covariance) < 1e-2 * np.trace(alone.covariance)
 
 
-@pytest.fixture
 def track():
+    """The objective of a walker of five frames, and a pose beside his."""
     rng = np.random.default_rng(5)
     truth = walker(5, rng)
     joints, covariance = seen(truth, 0.02, rng)
     joints[1, 0, 4] = np.nan
-    settings = BodyFittingSettings()
     contacts = Contacts(np.ones((5, 2)), np.ones((4, 2)), np.full((5, 2), 0.07))
-    evidence = PersonEvidence.of(joints[:, 0], covariance[:, 0], 50.0, settings)
+    evidence = PersonEvidence.of(joints[:, 0], covariance[:, 0], 50.0, SETTINGS)
     chained = ChainedKeypoints.of(KEYPOINTS)
-    made = PersonObjective(
-        chained, evidence, load_pose_prior(), settings, 50.0, 10.0, 0.03, contacts
-    )
     angles = truth.body_pose @ GATHER.T + 0.1 * rng.standard_normal((5, 30))
     pose = Pose(truth.transl + 0.01, truth.global_orient, angles, truth.betas[0])
-    return made, pose
+    given = (load_pose_prior(), SETTINGS, 50.0, 10.0, 0.03, contacts)
+    return PersonObjective(chained, evidence, *given), pose
 
 
 def test_one_motion_is_smoothed_alike_at_rates_above_120():
@@ -255,8 +249,8 @@ def test_one_motion_is_smoothed_alike_at_rates_above_120():
     assert costs[60.0] == pytest.approx(0.5 * costs[120.0], rel=0.05)
 
 
-def test_gradient_by_frames_and_betas_agrees_with_finite_differences(track):
-    made, pose = track
+def test_gradient_by_frames_and_betas_agrees_with_finite_differences():
+    made, pose = track()
     rng = np.random.default_rng(1)
     at = made.equations(pose, np.zeros((17, 3)), bordered=True)
     small = 1e-6
@@ -309,12 +303,7 @@ def scene(frames, hidden):
     rng = np.random.default_rng(6)
     truth = walker(frames, rng)
     weaving = 0.3 * np.sin(2.0 * np.pi * 0.8 * np.arange(frames) / 50.0)
-    truth = BodyParameters(
-        truth.betas,
-        truth.global_orient,
-        truth.body_pose,
-        truth.transl + weaving[:, None] * [1.0, 0.0, 0.0],
-    )
+    truth = replace(truth, transl=truth.transl + weaving[:, None] * [1.0, 0.0, 0.0])
     exact = KEYPOINTS(truth)
     joints, covariance = seen(truth, 0.01, rng)
     joints[hidden] = np.nan
@@ -403,13 +392,8 @@ def errors(fit, bodies):
     return feet, np.linalg.norm(fit.joints[:, :, 15:] - ankles, axis=-1).mean()
 
 
-@pytest.fixture(scope="module")
-def walk():
-    return fitted_people(2, 60, 1)
-
-
-def test_rolling_feet_are_fitted(walk):
-    bodies, evidence = walk
+def test_rolling_feet_are_fitted():
+    bodies, evidence = fitted_people(2, 60, 1)
     without = fit_bodies(MODEL, replace(evidence, extra=None), SETTINGS)
     with_feet = fit_bodies(MODEL, evidence, SETTINGS)
     assert without.extra is None and with_feet.extra.points == FEET

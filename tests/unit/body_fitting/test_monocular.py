@@ -22,7 +22,6 @@ from worldpose.errors import InputError
 from worldpose.geometry.rigid import Rigid
 from worldpose.simulation.detector_errors import MonocularErrors, estimate_bodies
 
-ONE = np.ones((1, 1))
 VECTORS = np.random.default_rng(0).normal(0.0, 0.4, (3, 24, 3))
 MATRICES = Rigid.from_rotvec(VECTORS, np.zeros(3)).rotation
 CROP = {"box_center": np.array([[10.0, 20.0], [30.0, 40.0], [50.0, 60.0]])}
@@ -161,26 +160,15 @@ def test_a_person_has_the_pose_of_the_camera_that_shows_it_largest():
     assert join_poses([]) is None
 
 
-def people_in_a_gap(seed=5):
-    """A walker whose limbs are not triangulated for one second, and the true bodies."""
-    rng = np.random.default_rng(seed)
+def test_right_glimpses_help_where_joints_are_missing_and_are_recorded():
+    """The limbs of a walker are not triangulated for one second."""
+    rng, settings = np.random.default_rng(5), BodyFittingSettings()
     truth = walker(100, rng)
     joints, covariance = seen(truth, 0.01, rng)
-    joints[30:80, :, 7:11] = np.nan
-    joints[30:80, :, 13:17] = np.nan
-    return truth, joints, covariance
-
-
-def glimpsed(truth, error, rng):
-    orient = rotation(truth.global_orient)[:, None]
-    angles = (truth.body_pose @ GATHER.T)[:, None]
-    return MonocularPoses(orient, angles + error * rng.standard_normal(angles.shape), ONE)
-
-
-def test_right_glimpses_help_where_joints_are_missing_and_are_recorded():
-    truth, joints, covariance = people_in_a_gap()
-    settings = BodyFittingSettings()
-    glimpses = glimpsed(truth, 0.1, np.random.default_rng(1))
+    joints[30:80, :, [*range(7, 11), *range(13, 17)]] = np.nan
+    orient, angles = rotation(truth.global_orient)[:, None], (truth.body_pose @ GATHER.T)[:, None]
+    angles = angles + 0.1 * np.random.default_rng(1).standard_normal(angles.shape)
+    glimpses = MonocularPoses(orient, angles, np.ones((1, 1)))
     alone = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), settings)
     guided = fit_bodies(
         MODEL, ClipEvidence(joints, covariance, 50.0, monocular_poses=glimpses), settings
