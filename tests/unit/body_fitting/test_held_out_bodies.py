@@ -19,7 +19,6 @@ from worldpose.body_fitting.monocular import parse_monocular
 from worldpose.body_fitting.plane_bodies import PlaneEvidence, fit_bodies_on_plane
 from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
-from worldpose.body_fitting.standing import find_standing_distance
 from worldpose.errors import InputError
 from worldpose.geometry.rigid import Rigid
 from worldpose.simulation.detector_errors import MonocularErrors, estimate_bodies
@@ -306,17 +305,6 @@ def test_regions_hold_the_truth_and_are_long_in_depth(fits):
         ratios.append(along / hips[..., 0, 0])
     assert np.mean(inside) > 0.9
     assert np.median(ratios) > 4.0
-
-
-def test_unseen_ankles_leave_the_given_distance_and_its_uncertainty():
-    """A place at 70 m is 0.5 m sure, an ankle 5 cm; one frame a second has errors of its own."""
-    unknown, place, information = np.array([np.nan]), np.array([70.0]), np.array([4.0])
-    found, variance = find_standing_distance(unknown, np.ones(1), 1.0, 0.0, place, information)
-    np.testing.assert_allclose([found[0], variance[0]], [70.0, 0.25])
-    found, variance = find_standing_distance(place + 0.1, np.ones(1), 1.0, 0.0, place, information)
-    # Weights 400 and 4, less the chance that the foot is in the air.
-    assert found[0] == pytest.approx(70.0 + 0.1 * 400.0 / 404.0, abs=0.005)
-    assert variance[0] == pytest.approx(1.0 / 404.0, rel=0.5)
 
 
 @pytest.mark.parametrize("seen", [0, 3])

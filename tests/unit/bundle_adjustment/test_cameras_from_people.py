@@ -183,14 +183,13 @@ def test_groups_that_show_different_people_are_named(walkers, cameras):
 QUICK = BundleAdjustmentSettings(max_frames=8, folds=2, solver=SolverSettings(min_cost_change=1e-6))
 
 
-@pytest.mark.parametrize(("noise", "share"), [(1.0, 0.4), (0.0, 0.45)])
-def test_people_bring_cameras_together(clip, noise, share):
-    made, true, _ = clip(noise=noise)
+def test_people_bring_cameras_together(clip):
+    made, true, _ = clip()
     adjusted = adjust_cameras(made, QUICK)
     assert adjusted.accepted.all()
     # Scatter of a pixel's rotation and of decimetres becomes what 800 keypoints per camera leave;
-    # what all cameras share stays as calibration has it. Seen without noise: 0.43.
-    assert errors(adjusted.cameras, true).mean() < share * errors(made.cameras, true).mean()
+    # what all cameras share stays as calibration has it.
+    assert errors(adjusted.cameras, true).mean() < 0.4 * errors(made.cameras, true).mean()
     assert (adjusted.verdict.loss[:, 1] < adjusted.verdict.loss[:, 0]).all()
     assert all(reason.startswith("accepted") for reason in adjusted.reasons)
 

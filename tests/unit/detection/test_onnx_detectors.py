@@ -155,14 +155,8 @@ def test_classes_of_people_are_named_numbered_or_asked_for():
     assert _class_names({"names": "{0: 'ball', 1: 'player'}"}) == {0: "ball", 1: "player"}
     assert _class_names({"names": "['ball']"}) == _class_names({"names": "{'ball': 0}"})
     assert _class_names({"names": "['ball']"}) == {0: "ball"}
-    assert (
-        _class_names({"names": "{'a': 'b'}"})
-        == _class_names({"names": "f()"})
-        == _class_names({"names": "'person'"})
-        == _class_names({"names": "{'person'}"})
-        == _class_names({})
-        == {}
-    )
+    for text in ("{'a': 'b'}", "f()", "'person'", "{'person'}"):
+        assert _class_names({"names": text}) == _class_names({}) == {}
 
 
 def test_nets_take_channels_and_grey_levels_as_in_their_training():
@@ -199,12 +193,7 @@ def test_a_crop_shows_the_box_and_its_points_come_back():
         box = np.array([[x - size * 0.2, y - size / 2, x + size * 0.2, y + size / 2]])
         mapping = frame_from_crop(crops_around(box, (48, 64))[0], (48, 64))
         crop = cut_crop(picture, mapping, (48, 64), 0)[..., 0].astype(float)
-        middle = np.array(
-            [
-                np.average(np.arange(48), weights=crop.sum(0)),
-                np.average(np.arange(64), weights=crop.sum(1)),
-            ]
-        )
+        middle = [np.average(np.arange(n), weights=crop.sum(k)) for k, n in enumerate((48, 64))]
         back = mapping[:, :2] @ middle + mapping[:, 2]
         if crop[0].any() or crop[-1].any() or crop[:, 0].any() or crop[:, -1].any():
             continue  # the square reaches over the crop: its middle is another

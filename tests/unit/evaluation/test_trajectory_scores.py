@@ -9,12 +9,7 @@ from people_samples import crowd, e4, person, score, tracks
 
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
-from worldpose.evaluation.cameras import (
-    CameraErrorSettings,
-    camera_samples,
-    evaluate_cameras,
-    surface_points,
-)
+from worldpose.evaluation.cameras import CameraErrorSettings, camera_samples, evaluate_cameras
 from worldpose.evaluation.metrics import evaluate_joints
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
@@ -315,11 +310,3 @@ def test_cameras_of_another_length_are_refused():
         evaluate_cameras(
             {"clip": Camera.stack([camera()] * 2)}, {"clip": Camera.stack([camera()] * 3)}, FLAT
         )
-
-
-def test_rays_over_the_horizon_and_missing_rays_meet_nothing():
-    upright = camera(AHEAD, (0.0, -60.0, 15.0))
-    points = surface_points(
-        upright.unproject([[900.0, 100.0], [900.0, 539.5], [np.nan, 1.0]]), FLAT
-    )
-    assert np.isnan(points).all()

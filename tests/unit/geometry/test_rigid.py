@@ -18,18 +18,6 @@ angles = st.floats(-1.0, 1.0)
 rotvecs = st.tuples(angles, angles, angles).map(np.array)
 
 
-def quarter_turn_about_z():
-    return Rigid.from_rotvec([0.0, 0.0, np.pi / 2], [10.0, 0.0, 0.0])
-
-
-def test_composition_applies_the_right_transform_first():
-    turn, shift = quarter_turn_about_z(), Rigid(np.eye(3), [1.0, 0.0, 0.0])
-    # Shift x = 1 to 2, turn it to y = 2, then add 10 to x.
-    np.testing.assert_allclose(
-        (turn @ shift).apply([[1.0, 0.0, 0.0]]), [[10.0, 2.0, 0.0]], atol=ROUNDING
-    )
-
-
 @given(rotvecs)
 def test_rotation_vector_equals_opencv_and_comes_back(rotvec):
     transform = Rigid.from_rotvec(rotvec, np.zeros(3))
