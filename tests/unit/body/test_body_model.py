@@ -21,26 +21,6 @@ from worldpose.body.jacobian import ChainedKeypoints
 from worldpose.body.keypoints import BODY25, fold_keypoints, fold_regressor
 from worldpose.body.model import BodyParameters
 from worldpose.errors import InputError, UsageError
-from worldpose.geometry.rigid import Rigid
-
-# The file is in single precision, and the regressors' rows sum to 1 only that well.
-SINGLE = 1e-6
-# Double precision at tens of metres.
-ROUNDING = 1e-12
-
-
-def test_orientation_turns_about_the_pelvis_and_translation_comes_after(open_body):
-    turned = replace(
-        BodyParameters.rest(), global_orient=np.array([0.3, -1.0, 2.0]), transl=np.array([9, 8, 7])
-    )
-    pelvis = open_body.joint_template[0]
-    joints = open_body.joints(turned)
-    np.testing.assert_allclose(joints[0], pelvis + turned.transl, atol=ROUNDING)
-    rotation = Rigid.from_rotvec(turned.global_orient, np.zeros(3)).rotation
-    expected = (open_body.joint_template - pelvis) @ rotation.T + pelvis + turned.transl
-    np.testing.assert_allclose(joints, expected, atol=ROUNDING)
-    expected = (open_body.template - pelvis) @ rotation.T + pelvis + turned.transl
-    np.testing.assert_allclose(open_body.vertices(turned), expected, atol=SINGLE)
 
 
 def test_a_person_with_missing_parameters_is_nan_and_the_others_are_not(open_body, people):

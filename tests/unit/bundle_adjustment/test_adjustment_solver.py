@@ -185,10 +185,6 @@ def test_what_cameras_err_by_in_common_is_taken_apart(rng):
     assert (share < 1.0).all()
 
 
-def found(made, cameras, limit=4.2, longest=10_000):
-    return keypoint_outliers(made, cameras, KeypointNoise(), limit, longest)
-
-
 def test_planted_keypoints_come_first(clip):
     made, true, _ = clip(cameras=8, frames=20, noise=0.9)
     rng = np.random.default_rng(8)
@@ -199,7 +195,8 @@ def test_planted_keypoints_come_first(clip):
     for row in sorted(planted):
         angle, length = rng.uniform(0.0, 2.0 * np.pi), 0.9 * rng.uniform(4.0, 30.0)
         image[row] += length * np.array([np.cos(angle), np.sin(angle)])
-    listed = found(replace(made, detections=replace(made.detections, keypoints=image)), true)
+    spoiled = replace(made, detections=replace(made.detections, keypoints=image))
+    listed = keypoint_outliers(spoiled, true, KeypointNoise(), 4.2, 10_000)
     first = list(zip(listed.frame, listed.camera, listed.person, listed.joint, strict=True))
     assert (np.diff(listed.surprise) <= 0).all()
     hits = planted & set(first[: len(planted)])

@@ -55,22 +55,23 @@ def cameras(walkers):
     return Camera.stack(found)
 
 
-def lens(camera, name, focal_std=2.0, focal=None):
-    return LensCalibration(
-        id=name,
-        image_size=SIZE,
-        focal_px=float(camera.focal[0]) if focal is None else focal,
-        principal_point_px=tuple(camera.principal_point.tolist()),
-        distortion=tuple(camera.coefficients.tolist()),
-        lens_model=LensModel(int(camera.lens_model)).label,
-        focal_std_px=focal_std,
-        principal_point_std_px=2.0,
-        distortion_std=0.005,
-    )
-
-
-def lenses(cameras, **about):
-    return [lens(cameras[c], name, **about) for c, name in enumerate(NAMES[: len(cameras.focal)])]
+def lenses(cameras, names=NAMES):
+    return [
+        LensCalibration(
+            id=name,
+            image_size=SIZE,
+            focal_px=float(camera.focal[0]),
+            principal_point_px=tuple(camera.principal_point.tolist()),
+            distortion=tuple(camera.coefficients.tolist()),
+            lens_model=LensModel(int(camera.lens_model)).label,
+            focal_std_px=2.0,
+            principal_point_std_px=2.0,
+            distortion_std=0.005,
+        )
+        for name, camera in zip(
+            names, (cameras[c] for c in range(len(cameras.focal))), strict=False
+        )
+    ]
 
 
 def seen(cameras, joints, noise=1.5):
@@ -175,7 +176,7 @@ def test_groups_that_show_different_people_are_named(walkers, cameras):
     both = KeypointDetections.from_keypoints(
         keypoints, np.where(np.isfinite(keypoints[..., 0]), 0.9, np.nan)
     )
-    halls = [lens(cameras[c], f"{hall}{c}") for hall in "ab" for c in range(4)]
+    halls = [one for hall in "ab" for one in lenses(cameras, [f"{hall}{c}" for c in range(4)])]
     with pytest.raises(InputError, match="2 groups that share no person: a0, a1, a2, a3; b0, b1"):
         locate_cameras(halls, both, FPS, KnownLength(1.8))
 

@@ -27,7 +27,12 @@ from worldpose.detection.bundled_pose import (
 )
 from worldpose.detection.enlargement import expect_parts, find_small
 from worldpose.detection.interfaces import People
-from worldpose.detection.models import BUNDLED_WEIGHTS, load_bundled_detector, load_bundled_pose
+from worldpose.detection.models import (
+    BUNDLED_WEIGHTS,
+    LANDMARK_WEIGHTS,
+    load_bundled_detector,
+    load_bundled_pose,
+)
 from worldpose.detection.net_inference import QuantizedNet, run_together
 from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError
@@ -132,10 +137,10 @@ def test_joints_are_the_peaks_that_a_search_over_all_cells_finds(kind):
         np.testing.assert_allclose(places[one][:count], said, atol=1e-3)
 
 
-@pytest.mark.parametrize("which", [0, 1])
-def test_nets_in_integers_are_of_the_shipped_weights(which):
-    net = QuantizedNet(BUNDLED_WEIGHTS[which].with_suffix(".onnx"))
-    assert net.weights_sha256 == digest_of_files(BUNDLED_WEIGHTS[which])
+@pytest.mark.parametrize("weights", [*BUNDLED_WEIGHTS, LANDMARK_WEIGHTS], ids=lambda p: p.stem)
+def test_nets_in_integers_are_of_the_shipped_weights(weights):
+    net = QuantizedNet(weights.with_suffix(".onnx"))
+    assert net.weights_sha256 == digest_of_files(weights)
 
 
 def test_nets_in_integers_see_what_they_see_in_floating_point(still):
@@ -280,25 +285,20 @@ class Told:
         return [CropEstimates(places, flat, flat, seen, np.full(len(boxes), self.fit))]
 
 
-def found(*boxes, score=0.8):
-    return People(np.array(boxes).reshape(-1, 4), np.full(len(boxes), score))
-
-
 def test_who_is_hidden_by_half_is_found_once_with_his_own_box_and_pose():
     look = Told(FRONT, HIDDEN, FAR)
-    (people,) = run_together([find_occluded_people(found(FRONT, FAR))], look)
-    assert_allclose(people.boxes, [HIDDEN])
-    assert_allclose(people.score, [np.cbrt(0.3 * 0.9 * 0.8)])
-    assert_allclose(people.keypoints[0, 0], HIDDEN[:2])
-    assert_allclose(people.keypoints[0, 16], HIDDEN[2:])
+    (found,) = run_together([find_occluded_people(people(FRONT, FAR, score=0.8))], look)
+    assert_allclose(found.boxes, [HIDDEN])
+    assert_allclose(found.score, [np.cbrt(0.3 * 0.9 * 0.8)])
+    assert_allclose(found.keypoints[0, [0, 16]].ravel(), HIDDEN)
     # A step of 0.35 widths to either side of both; then about the one who was seen.
     assert_allclose(look.asked[0][:, 0], [86.0, 386.0, 114.0, 414.0])
     assert_allclose(look.asked[1], [HIDDEN] * len(look.asked[1]))
 
 
-@pytest.mark.parametrize("people", [found(FRONT, FAR), found(FRONT, HIDDEN, FAR), found()])
-def test_where_all_are_known_nobody_is_found(people):
-    (others,) = run_together([find_occluded_people(people)], Told(*people.boxes))
+@pytest.mark.parametrize("boxes", [(FRONT, FAR), (FRONT, HIDDEN, FAR), ()])
+def test_where_all_are_known_nobody_is_found(boxes):
+    (others,) = run_together([find_occluded_people(people(*boxes, score=0.8))], Told(*boxes))
     assert (others.boxes.shape, others.score.shape) == ((0, 4), (0,))
     assert others.keypoints.shape == (0, 17, 2)
     assert others.confidence.shape == (0, 17)

@@ -10,7 +10,7 @@ from worldpose.detection.box_tracking import BoxCleaner, BoxTracker, detect_stri
 from worldpose.detection.interfaces import People
 from worldpose.detection.pipeline import PeopleFinder, Place, detect_people, on_pitch
 from worldpose.detection.settings import DetectionSettings
-from worldpose.detection.suppression import combine_boxes, suppress
+from worldpose.detection.suppression import combine_boxes
 from worldpose.detection.turning import QuarterTurn
 from worldpose.detection.views import TiledDetector
 from worldpose.errors import InputError
@@ -212,11 +212,6 @@ def test_two_people_who_cross_keep_their_tracks():
         boxes = np.array([walker(frame, 100, 4, 60), walker(frame, 260, -4, 80)])
         ids.append(tracker.update(boxes, np.array([0.9, 0.9])))
     assert np.unique(np.array(ids), axis=0).tolist() == [[0, 1]]
-
-
-def test_the_best_of_two_boxes_of_a_person_stays():
-    found = suppress(people([0, 0, 10, 20, 0.5], [1, 0, 11, 20, 0.9], [50, 0, 60, 20, 0.2]), 0.6)
-    assert found.scores.tolist() == [0.9, 0.2]
 
 
 class Blobs:

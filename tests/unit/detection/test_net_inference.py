@@ -20,13 +20,12 @@ from worldpose.detection.bundled_pose import BundledPoseEstimator
 from worldpose.detection.crops import CROP
 from worldpose.detection.interfaces import People
 from worldpose.detection.landmark_net import POINTS, LandmarkEstimator
-from worldpose.detection.models import BUNDLED_WEIGHTS, LANDMARK_WEIGHTS, load_landmarks
+from worldpose.detection.models import BUNDLED_WEIGHTS, load_landmarks
 from worldpose.detection.net_inference import CROPS, PlacedNet, QuantizedNet
 from worldpose.detection.pipeline import PeopleFinder, detect_people
 from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError
 from worldpose.geometry.boxes import box_iou
-from worldpose.ingest.registration import digest_of_files
 
 on_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 
@@ -206,11 +205,6 @@ def shot():
         labels = importlib.import_module("landmark_labels")
         (shot,) = scenes.render_scene(scenes.HELD_OUT, 39_001, views=1, frames=1)
         yield shot, labels.label_landmarks(shot)
-
-
-def test_the_net_in_integers_was_made_from_the_shipped_weights():
-    net = QuantizedNet(LANDMARK_WEIGHTS.with_suffix(".onnx"))
-    assert net.weights_sha256 == digest_of_files(LANDMARK_WEIGHTS)
 
 
 def test_the_shipped_net_finds_landmarks_of_unknown_people(shot):

@@ -56,10 +56,6 @@ def raw_yolox():
     return found
 
 
-def logit(share):
-    return np.log(share / (1.0 - share))
-
-
 def detr(classes, person, score):
     """Queries of a DETR: logits, and boxes in shares of the image."""
     logits, boxes = np.full((30, classes), -9.0), np.full((30, 4), 0.5)
@@ -68,26 +64,13 @@ def detr(classes, person, score):
     return [logits, boxes]
 
 
-def decoded_yolox():
-    found = grid(CELLS, 1)
-    rows, columns = np.mgrid[:8, :12]
-    found[: 12 * 8, :2] = np.stack([columns, rows], -1).reshape(-1, 2) * 8.0 + 4.0
-    found[5, :4], found[9, :4] = PERSON, CAR
-    return found
-
-
-def yolov6():
-    found = grid(CELLS, 1)
-    found[:, 4] = 1.0
-    return found
-
-
-def softmax():
-    logits, boxes = detr(92, 1, 4.0)
-    logits[:, -1] = 0.0  # no object
-    return [logits, boxes]
-
-
+DECODED, YOLOV6, NO_OBJECT = grid(CELLS, 1), grid(CELLS, 1), detr(92, 1, 4.0)
+ROWS, COLUMNS = np.mgrid[:8, :12]
+DECODED[: 12 * 8, :2] = np.stack([COLUMNS, ROWS], -1).reshape(-1, 2) * 8.0 + 4.0
+DECODED[5, :4], DECODED[9, :4] = PERSON, CAR
+YOLOV6[:, 4] = 1.0
+NO_OBJECT[0][:, -1] = 0.0
+LOGIT = np.log(0.7 / 0.3)
 MOVENET = np.zeros((6, 56))
 MOVENET[0, 51:] = [20 / 64, 10 / 96, 60 / 64, 30 / 96, 0.7]
 DETS = np.array([[10, 20, 30, 60, 0.7], [60, 20, 80, 40, 0.9]])
@@ -95,14 +78,14 @@ NMS = np.insert(DETS, 5, [0, 2], axis=1)
 LABELS, SCORES = np.array([0, 2]), np.array([0.7, 0.9])
 OUTPUTS = {
     "yolox": ([raw_yolox()], 0.72),
-    "yolox-decoded": ([decoded_yolox()], 0.72),
+    "yolox-decoded": ([DECODED], 0.72),
     "yolov5": ([grid(3 * CELLS, 1)], 0.72),
-    "yolov6": ([yolov6()], 0.8),
+    "yolov6": ([YOLOV6], 0.8),
     "yolov8": ([grid(CELLS, 0).T], 0.8),
     "yolo-nms": ([NMS], 0.7),
-    "detr": (softmax(), np.exp(4.0) / (np.exp(4.0) + 1.0 + 90 * np.exp(-9.0))),
-    "rfdetr": (detr(91, 1, logit(0.7)), 0.7),
-    "rtdetr": (detr(80, 0, logit(0.7)), 0.7),
+    "detr": (NO_OBJECT, np.exp(4.0) / (np.exp(4.0) + 1.0 + 90 * np.exp(-9.0))),
+    "rfdetr": (detr(91, 1, LOGIT), 0.7),
+    "rtdetr": (detr(80, 0, LOGIT), 0.7),
     "rtdetr-boxes": ([LABELS, DETS[:, :4], SCORES], 0.7),
     "movenet": ([MOVENET], 0.7),
 }

@@ -129,12 +129,6 @@ def on_plane(points):
     return np.concatenate([points, np.ones((len(points), 1))], axis=1)
 
 
-def spokes(radii, count=12):
-    angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
-    directions = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    return (np.asarray(radii)[:, None, None] * directions).reshape(-1, 2)
-
-
 @pytest.mark.parametrize(
     ("k1", "k2", "k3", "squared"),
     [
@@ -175,8 +169,10 @@ def test_inverse_holds_up_to_the_brink_of_the_fold(k):
     camera = plane_camera(k1=k1, k2=k2, k3=k3)
     fold = float(fold_radius([k1, k2, 0.0, 0.0, k3]))
     # At 1e-7 before the fold the image is 1e-14 short of its limit; at 1e-8 that is rounding.
-    points = spokes(fold * (1.0 - np.logspace(-1, -7, 7)))
-    image = camera.project(on_plane(points))
+    angle = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
+    spokes = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    points = (fold * (1.0 - np.logspace(-1, -7, 7)))[:, None, None] * spokes
+    image = camera.project(on_plane(points.reshape(-1, 2)))
     rays = camera.unproject(image)
     assert rays.valid.all()
     back = camera.project(rays.directions)

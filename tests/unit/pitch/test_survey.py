@@ -76,12 +76,9 @@ def test_a_noisy_survey_keeps_its_own_distances(angle, seed):
     assert 0.005 < np.sqrt(np.mean(fit.offset_plan**2)) < 0.06
 
 
-def mirrored(survey):
-    return Survey(survey.where, survey.names, survey.places * (1.0, -1.0, 1.0))
-
-
 def test_a_left_handed_frame_is_refused_unless_it_is_said():
-    survey = mirrored(surveyed(angle=0.7))
+    survey = surveyed(angle=0.7)
+    survey = Survey(survey.where, survey.names, survey.places * (1.0, -1.0, 1.0))
     with pytest.raises(InputError, match=r"mirror image.*left and right.*left-handed"):
         fit_survey(survey)
     fit = fit_survey(survey, SurveySettings(left_handed=True))

@@ -227,23 +227,16 @@ def test_result_is_the_least_squares_point_of_the_weighted_pixels(ring):
             assert (cost(moved) > best).all()
 
 
-def monte_carlo(cameras, scale):
-    """Errors and covariances of one joint under white noise of `scale` [px], 4000 times."""
-    joint = np.array([1.0, -2.0, 1.2])
-    keypoints, confidence, index = seen(cameras, np.broadcast_to(joint, (4000, 1, 1, 3)))
-    rng = np.random.default_rng(5)
-    confidence[...] = np.linspace(0.4, 1.0, keypoints.shape[1])[:, None, None]
-    keypoints = (
-        keypoints + scale * rng.normal(size=keypoints.shape) / np.sqrt(confidence)[..., None]
-    )
-    loose = WHITE.model_copy(update={"pixel_noise_px": scale, "max_deviation": 6.0})
-    result = triangulate_joints(cameras, as_detections(keypoints, confidence, index), loose)
-    return result.joints[:, 0, 0] - joint, result.covariance[:, 0, 0]
-
-
 def test_covariance_is_the_spread_of_a_monte_carlo(ring):
-    errors, covariance = monte_carlo(ring(8, arc=2.0), 1.0)
-    stated = covariance.mean(axis=0)
+    """One joint under white noise, 4000 times."""
+    cameras, joint = ring(8, arc=2.0), np.array([1.0, -2.0, 1.2])
+    keypoints, confidence, index = seen(cameras, np.broadcast_to(joint, (4000, 1, 1, 3)))
+    noise = np.random.default_rng(5).normal(size=keypoints.shape)
+    confidence[...] = np.linspace(0.4, 1.0, keypoints.shape[1])[:, None, None]
+    keypoints = keypoints + noise / np.sqrt(confidence)[..., None]
+    loose = WHITE.model_copy(update={"max_deviation": 6.0})
+    result = triangulate_joints(cameras, as_detections(keypoints, confidence, index), loose)
+    errors, stated = result.joints[:, 0, 0] - joint, result.covariance[:, 0, 0].mean(axis=0)
     sampled = errors.T @ errors / len(errors)
     # In coordinates where the stated covariance is the identity, the sampled one has entries
     # with standard deviation sqrt(2 / 4000) = 0.022; four of these.
