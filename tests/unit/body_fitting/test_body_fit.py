@@ -294,10 +294,6 @@ def test_a_person_of_several_clips_is_what_they_say_together_with_anybody_counte
 CAMERA = broadcast(1)
 
 
-def tracked(keypoints, index):
-    return KeypointDetections.from_keypoints(keypoints, keypoints[..., 0], index)
-
-
 def scene(frames, hidden):
     """A person who weaves before one camera, and the joints, without `hidden` frames."""
     rng = np.random.default_rng(6)
@@ -316,7 +312,8 @@ def test_stretches_of_one_view_are_filled_better_than_by_motion_alone():
     hidden = slice(20, 20 + length)
     exact, joints, covariance, keypoints, index = scene(40 + length, hidden)
     settings = BodyFittingSettings(max_filled_gap_s=2.0)
-    lines = find_ray_constraints(CAMERA, tracked(keypoints, index), joints)
+    detections = KeypointDetections.from_keypoints(keypoints, keypoints[..., 0], index)
+    lines = find_ray_constraints(CAMERA, detections, joints)
     alone = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), settings)
     lined = fit_bodies(
         MODEL, ClipEvidence(joints, covariance, 50.0, ray_constraints=[lines]), settings

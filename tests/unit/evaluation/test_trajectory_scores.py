@@ -206,11 +206,6 @@ def camera(rotation=DOWN, center=(0.0, 0.0, 50.0), focal=1000.0):
     return plain_camera(focal, (959.5, 539.5), Rigid(rotation, -rotation @ np.array(center)))
 
 
-def tilted(down, center):
-    """Looks along y, down by an angle [rad]."""
-    return camera(Rigid.from_rotvec([down, 0.0, 0.0], np.zeros(3)).rotation @ AHEAD, center, 3000.0)
-
-
 def errors(estimated, true, pitch=FLAT, **settings):
     found, cameras = evaluate_cameras(
         {"a": estimated}, {"a": true}, pitch, CameraErrorSettings(**settings)
@@ -220,7 +215,8 @@ def errors(estimated, true, pitch=FLAT, **settings):
 
 
 def test_the_true_camera_has_no_error():
-    true = tilted(0.2, (3.0, -70.0, 15.0))
+    down = Rigid.from_rotvec([0.2, 0.0, 0.0], np.zeros(3)).rotation
+    true = camera(down @ AHEAD, (3.0, -70.0, 15.0), 3000.0)
     found = errors(true, true, CROWNED)
     for name, value in found.model_dump().items():
         # Back-projection from 100 m, rounded; 1 is the number of cameras and their coverage.

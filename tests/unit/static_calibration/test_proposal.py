@@ -37,14 +37,10 @@ def still(center=(-24.0, -60.0, 22.0)):
     return render_pitch(camera(center), PITCH, None, 3)
 
 
-def feet():
-    x, y = np.meshgrid(np.linspace(-50.0, -15.0, 8), np.linspace(-25.0, 25.0, 8))
-    return np.stack([x.ravel(), y.ravel(), PITCH.height(x, y).ravel()], axis=-1)
-
-
 def misplaced(found, true):
     """Distances on the pitch [m] between places and the back-projections of their true pixels."""
-    places = feet()
+    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-50, -15, 8), np.linspace(-25, 25, 8)))
+    places = np.stack([x, y, PITCH.height(x, y)], axis=-1)
     pixels = true.project(places)
     seen = ((pixels > 0.0) & (pixels < true.image_size - 1.0)).all(axis=-1)
     rays = found.unproject(pixels[seen])

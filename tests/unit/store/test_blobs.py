@@ -41,17 +41,14 @@ def test_of_many_that_put_one_new_file_one_succeeds(store):
     assert not store.blobs.put_new(path, b"later") and store.blobs.staged_entries() == []
 
 
-def failing(code):
-    def fail(*_, **__):
-        raise OSError(code, os.strerror(code))
-
-    return fail
-
-
 @pytest.fixture(params=[errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS])
 def without_links(request, monkeypatch):
     """What exFAT, SMB and FUSE answer to link()."""
-    monkeypatch.setattr(os, "link", failing(request.param))
+
+    def fail(*_, **__):
+        raise OSError(request.param, os.strerror(request.param))
+
+    monkeypatch.setattr(os, "link", fail)
 
 
 @pytest.fixture

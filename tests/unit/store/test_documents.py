@@ -104,10 +104,6 @@ def test_other_json_is_corruption(data):
         unseal(RunRecord, data, "the place")
 
 
-def describe(old, new):
-    return [str(each) for each in recipe_differences(old, new)]
-
-
 @pytest.mark.parametrize(
     ("change", "line"),
     [
@@ -127,7 +123,7 @@ def describe(old, new):
 )
 def test_every_change_has_its_own_line_and_its_own_key(change, line):
     changed = sample_recipe(**change)
-    assert describe(sample_recipe(), changed) == [line]
+    assert [str(each) for each in recipe_differences(sample_recipe(), changed)] == [line]
     assert recipe_key(changed) != recipe_key(sample_recipe())
 
 

@@ -83,14 +83,6 @@ def test_a_duplicate_extends_the_track_that_takes_it_over(span, whole):
 FRAME = np.arange(100, 200)
 
 
-def clip(**absent):
-    """Two people in 100 frames, 25 per second; rows in which one is not seen."""
-    present = np.ones((100, 2), dtype=bool)
-    for name, (first, last) in absent.items():
-        present[first : last + 1, {"one": [0], "two": [1], "both": [0, 1]}[name]] = False
-    return present
-
-
 @pytest.mark.parametrize(
     ("absent", "share", "longest"),
     [
@@ -106,7 +98,10 @@ def clip(**absent):
 def test_absences(absent, share, longest):
     names = ("absent_from_frame", "absent_to_frame", "absent_person")
     expected = {"absent_share": pytest.approx(share), **dict(zip(names, longest, strict=False))}
-    assert measure_absences(clip(**absent), FRAME, [7, 9], 25.0) == expected
+    present = np.ones((100, 2), dtype=bool)  # two people, 25 frames per second
+    for who, (first, last) in absent.items():
+        present[first : last + 1, {"one": [0], "two": [1], "both": [0, 1]}[who]] = False
+    assert measure_absences(present, FRAME, [7, 9], 25.0) == expected
 
 
 def test_a_clip_without_people_misses_them_all():
@@ -202,17 +197,11 @@ def people(lefts):
     return keypoints, np.where(np.isfinite(keypoints[..., 0]), 0.9, np.nan), boxes
 
 
-def draw(lefts, colours):
-    image = np.empty((100, 200, 3), dtype=np.uint8)
-    image[:] = GRASS
-    for left, colour in zip(lefts, colours, strict=True):
-        image[31:52, left + 4 : left + 17] = colour
-    return image
-
-
 def test_the_colour_is_that_of_the_upper_body_with_and_without_keypoints():
     keypoints, confidence, boxes = people([20, 120])
-    image = draw([20, 120], [RED, BLUE])
+    image = np.tile(np.array(GRASS, dtype=np.uint8), (100, 200, 1))
+    for left, colour in ((20, RED), (120, BLUE)):
+        image[31:52, left + 4 : left + 17] = colour
     found = measure_shirts(image, keypoints, confidence, boxes)
     np.testing.assert_allclose(found, [lab(RED), lab(BLUE)], atol=1e-3)
     confidence[:] = np.nan
