@@ -381,6 +381,20 @@ def test_cameras_that_share_no_runner_have_clocks_of_two_groups():
     assert (late[1] - late[0], late[3] - late[2]) == pytest.approx((5.0, 2.0), abs=0.3)
 
 
+def test_clocks_of_a_long_clip_are_compared_where_two_cameras_show_the_same_people():
+    fps, frame = 10.0, np.arange(1000)
+    turn, apart = np.random.default_rng(9).uniform(0.0, 6.0, 5), 4.0 * np.arange(5)[:, None]
+
+    def places(frame):
+        phase = 0.8 * frame[:, None] / fps + turn
+        return apart + 3.0 * np.stack([np.sin(phase), np.cos(phase)], axis=-1)
+
+    seen = np.stack([places(frame), places(frame + 5)], axis=1)
+    seen[:680, 1] -= 30.0  # others
+    found = estimate_plane_clocks(positions_at(seen), fps, pitch_size=SIZE)
+    assert fps * (found.seconds[1] - found.seconds[0]) == pytest.approx(5.0, abs=0.3)
+
+
 def path_of(first, frames, start, velocity, camera):
     """A path at constant velocity, seen by a camera."""
     xy = np.asarray(start) + np.arange(frames)[:, None] / GROUND_FPS * np.asarray(velocity)

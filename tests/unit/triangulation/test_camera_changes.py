@@ -424,3 +424,17 @@ def test_a_step_that_covers_a_short_clip_stays_as_it_is():
         np.tile(np.eye(5), (len(rows), 1, 1)), np.zeros((len(rows), 5)), rows, 25.0, np.ones(1)
     )
     assert fit_parts(sums, parts, 25, ("clock",)) == parts
+
+
+def test_a_bin_of_two_chunks_is_one_bin(cameras):
+    size = 5 * len(cameras.focal)
+
+    def chunk(*rows):
+        matrix, score = np.tile(np.eye(size), (len(rows), 1, 1)), np.ones((len(rows), size))
+        return ChangeSums(matrix, score, np.array(rows), FPS, np.ones(len(cameras.focal)))
+
+    joined = ChangeSums.join([chunk(2.0, 7.0), chunk(7.0, 12.0)], cameras, FPS)
+    assert joined.rows.tolist() == [2.0, 7.0, 12.0]
+    assert joined.matrix[:, 0, 0].tolist() == joined.score[:, 3].tolist() == [1.0, 2.0, 1.0]
+    # A clip without people has no bins.
+    assert ChangeSums.join([], cameras, FPS).matrix.shape == (0, size, size)
