@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_monocular import broadcast
-from walking_bodies import KEYPOINTS, MODEL, seen, walker
+from walking_bodies import KEYPOINTS, MODEL, panning_camera, seen, walker
 
 from data_contracts.conventions import FEET
 from data_contracts.keypoints import KeypointDetections
@@ -291,7 +290,7 @@ def test_a_person_of_several_clips_is_what_they_say_together_with_anybody_counte
         assert agree(clips[0], Shape(clips[0].betas + [apart, 0.0], covariance)) == said
 
 
-CAMERA = broadcast(1)
+CAMERA = panning_camera(1)
 
 
 def scene(frames, hidden):

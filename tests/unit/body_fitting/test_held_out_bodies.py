@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from camera_builders import plain_camera, ring_of_cameras
+from camera_builders import ring_of_cameras
 from scipy.special import chdtri
-from walking_bodies import KEYPOINTS, MODEL, walker
+from walking_bodies import KEYPOINTS, MODEL, panning_camera, walker
 
 from data_contracts.conventions import JOINT_GROUPS
 from data_contracts.keypoints import KeypointDetections
@@ -20,7 +20,6 @@ from worldpose.body_fitting.plane_bodies import PlaneEvidence, fit_bodies_on_pla
 from worldpose.body_fitting.results import ClipEvidence
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.errors import InputError
-from worldpose.geometry.rigid import Rigid
 from worldpose.simulation.detector_errors import MonocularErrors, estimate_bodies
 from worldpose.tracking.tracker import track_people
 from worldpose.triangulation.estimate import triangulate_joints
@@ -186,19 +185,6 @@ PLACE_STD = np.array([0.08, 0.30])
 """Errors of places across and along the line of sight [m]."""
 
 
-def panning_camera(frames):
-    """A camera 60 m beside the pitch, 14 m up, that pans past the origin."""
-    pan = np.linspace(-0.03, 0.08, frames)
-    down = np.arctan2(CENTER[2] - 1.0, -CENTER[1])
-    x = np.stack([np.cos(pan), np.sin(pan), 0.0 * pan], axis=-1)
-    ahead = np.stack([-np.sin(pan), np.cos(pan), 0.0 * pan], axis=-1)
-    z = np.cos(down) * ahead - np.sin(down) * np.array([0.0, 0.0, 1.0])
-    rotation = np.stack([x, np.cross(z, x), z], axis=1)
-    return plain_camera(
-        np.full(frames, 3500.0), (959.5, 539.5), Rigid(rotation, -rotation @ CENTER)
-    )
-
-
 class Clip:
     """Two people who walk on flat ground, their estimates and detections."""
 
@@ -214,7 +200,7 @@ class Clip:
             values.append((body.betas, body.global_orient, body.body_pose, transl))
         self.bodies = BodyParameters(*(np.stack(v, axis=1) for v in zip(*values, strict=True)))
         self.truth = KEYPOINTS(self.bodies)
-        self.camera = panning_camera(frames)
+        self.camera = panning_camera(frames, (-0.03, 0.08), CENTER, 3500.0)
         drawn = estimate_bodies(
             MODEL, self.bodies, self.camera, FPS, errors or MonocularErrors(), rng
         )

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from camera_builders import plain_camera
-from walking_bodies import KEYPOINTS, MODEL, seen, walker
+from walking_bodies import KEYPOINTS, MODEL, panning_camera, seen, walker
 
 from worldpose.body.model import BodyParameters
 from worldpose.body_fitting.estimate import fit_bodies
@@ -104,18 +103,6 @@ def test_boxes_with_scores_and_classes_or_of_nobody_and_frames_as_text_are_read(
 EXACT = MonocularErrors(turn=0.0, facing=0.0, size=0.0, place=0.0, missed=0.0)
 
 
-def broadcast(frames):
-    """A camera 70 m beside the pitch, 15 m up, that pans past the origin."""
-    pan = np.linspace(-0.12, 0.12, frames)
-    down = np.arctan2(15.0, 70.0)
-    x = np.stack([np.cos(pan), np.sin(pan), 0.0 * pan], axis=-1)
-    ahead = np.stack([-np.sin(pan), np.cos(pan), 0.0 * pan], axis=-1)
-    z = np.cos(down) * ahead - np.sin(down) * np.array([0.0, 0.0, 1.0])
-    rotation = np.stack([x, np.cross(z, x), z], axis=-2)
-    center = np.array([0.0, -70.0, 15.0])
-    return plain_camera(4000.0, (959.5, 539.5), Rigid(rotation, -(rotation @ center)))
-
-
 def crowd(frames):
     """Three walkers 3 m apart (frames, 3)."""
     rng = np.random.default_rng(3)
@@ -135,7 +122,7 @@ def estimates(bodies, camera, errors=EXACT, seed=0):
 
 
 def test_exact_bodies_of_crops_come_back_in_the_world_at_their_persons():
-    bodies, camera = crowd(6), broadcast(6)
+    bodies, camera = crowd(6), panning_camera(6)
     joints = KEYPOINTS(bodies)
     found = place_monocular_poses(estimates(bodies, camera), camera, np.arange(6), joints)
     true = Rigid.from_rotvec(bodies.global_orient, np.zeros(3)).rotation

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from clicking_people import paint_of, pinhole
+from clicking_people import ground_errors, paint_of, pinhole
 
 from worldpose.errors import InputError
 from worldpose.pitch.template import PitchTemplate
@@ -37,16 +37,8 @@ def still(center=(-24.0, -60.0, 22.0)):
     return render_pitch(camera(center), PITCH, None, 3)
 
 
-def misplaced(found, true):
-    """Distances on the pitch [m] between places and the back-projections of their true pixels."""
-    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-50, -15, 8), np.linspace(-25, 25, 8)))
-    places = np.stack([x, y, PITCH.height(x, y)], axis=-1)
-    pixels = true.project(places)
-    seen = ((pixels > 0.0) & (pixels < true.image_size - 1.0)).all(axis=-1)
-    rays = found.unproject(pixels[seen])
-    reach = (places[seen, 2] - rays.origins[:, 2]) / rays.directions[:, 2]
-    met = rays.origins + reach[:, None] * rays.directions
-    return np.linalg.norm(met - places[seen], axis=-1)
+X, Y = (axis.ravel() for axis in np.meshgrid(np.linspace(-50, -15, 8), np.linspace(-25, 25, 8)))
+PLACES = np.stack([X, Y, PITCH.height(X, Y)], axis=-1)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +48,7 @@ def proposal():
 
 def test_a_rendered_still_gives_its_camera_without_a_click(proposal):
     found = calibrate_proposal(PITCH, proposal, still(), where="image of cam3")
-    off = misplaced(found.estimate.camera, camera())
+    off = ground_errors(found.estimate.camera, camera(), PLACES)
     assert len(off) > 20
     assert np.median(off) < 0.05
     assert found.report.decisions[0].startswith("markings proposed from the image")
@@ -66,7 +58,7 @@ def test_a_rendered_still_gives_its_camera_without_a_click(proposal):
 def test_a_purple_cast_hides_no_pitch():
     cast = np.clip(still() * np.array([1.4, 0.5, 1.4]), 0, 255).astype(np.uint8)
     found = calibrate_proposal(PITCH, propose_camera(cast, PITCH, side="near"), cast)
-    assert np.median(misplaced(found.estimate.camera, camera())) < 0.05
+    assert np.median(ground_errors(found.estimate.camera, camera(), PLACES)) < 0.05
 
 
 def test_a_proposal_whose_markings_are_not_in_the_image_is_refused(proposal):
