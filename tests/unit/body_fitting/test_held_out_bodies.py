@@ -200,7 +200,7 @@ class Clip:
             values.append((body.betas, body.global_orient, body.body_pose, transl))
         self.bodies = BodyParameters(*(np.stack(v, axis=1) for v in zip(*values, strict=True)))
         self.truth = KEYPOINTS(self.bodies)
-        self.camera = panning_camera(frames, (-0.03, 0.08), CENTER, 3500.0)
+        self.camera = panning_camera(frames, (-0.03, 0.08), CENTER, 3500.0, 1.0)
         drawn = estimate_bodies(
             MODEL, self.bodies, self.camera, FPS, errors or MonocularErrors(), rng
         )

@@ -44,10 +44,10 @@ def seen(parameters, noise, rng):
     return joints, np.broadcast_to(spread, (*joints.shape, 3)).copy()
 
 
-def panning_camera(frames, pan=(-0.12, 0.12), center=(0.0, -70.0, 15.0), focal=4000.0):
-    """A camera in a stand that pans past the origin by angles [rad]."""
+def panning_camera(frames, pan=(-0.12, 0.12), center=(0.0, -70.0, 15.0), focal=4000.0, aim=0.0):
+    """A camera in a stand that pans by angles [rad] past a point above the origin [m]."""
     pan, center = np.linspace(*pan, frames), np.array(center)
-    down = np.arctan2(center[2], -center[1])
+    down = np.arctan2(center[2] - aim, -center[1])
     x = np.stack([np.cos(pan), np.sin(pan), 0.0 * pan], axis=-1)
     ahead = np.stack([-np.sin(pan), np.cos(pan), 0.0 * pan], axis=-1)
     z = np.cos(down) * ahead - np.sin(down) * np.array([0.0, 0.0, 1.0])

@@ -116,11 +116,10 @@ def test_the_distance_map_is_looked_up_at_rounded_pixels_with_its_slope():
 def test_stage_3_moves_projected_markings_onto_drawn_ones():
     from worldpose.simulation.renderer import render_pitch
 
-    pitch, size = PitchTemplate.standard(), (960, 540)
-    true = look_at_camera((0.0, -70.0, 25.0), (-30, 0, 0), 900.0, size)
+    pitch, true = PitchTemplate.standard(), look_at_camera((0.0, -70.0, 25.0), (-30, 0, 0), 1800.0)
     picture = render_pitch(true, pitch, None, 0)
     lines = pitch.sample_lines(0.3).points_world
-    start = look_at_camera((0.0, -70.0, 25.0), (-30.4, 0.1, 0), 910.0, size)
+    start = look_at_camera((0.0, -70.0, 25.0), (-30.2, 0.05, 0), 1810.0)
 
     def error(camera):
         off = np.linalg.norm(camera.project(lines) - true.project(lines), axis=1)

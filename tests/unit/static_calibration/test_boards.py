@@ -133,7 +133,7 @@ FISHEYE = np.array([-0.03, 0.01, -0.004, 0.001])
 def fisheye_views(rng, reach):
     matrix = np.array([[420.0, 0.0, 655.0], [0.0, 420.0, 349.0], [0.0, 0.0, 1.0]])
     views = []
-    while len(views) < 10:
+    while len(views) < 14:
         turn = cv2.Rodrigues(rng.uniform(-0.6, 0.6, 3))[0]
         middle = 0.35 * np.append(rng.uniform(-1.0, 1.0, 2) * reach, 1.0)
         points = np.column_stack([PLACES - PLACES.mean(axis=0), np.zeros(len(PLACES))])
