@@ -1,6 +1,5 @@
 """A camera is calibrated by clicks of known markings, and states its errors."""
 
-import warnings
 from dataclasses import replace
 
 import clicking_people as people
@@ -20,7 +19,6 @@ from worldpose.simulation.renderer import render_pitch
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import place_camera
 from worldpose.simulation.settings import ClickSettings
-from worldpose.static_calibration.click_outliers import fit_inliers
 from worldpose.static_calibration.estimate import calibrate_camera
 from worldpose.static_calibration.evidence import gather_evidence, has_enough_points
 from worldpose.static_calibration.fit import build_problem, compute_residuals
@@ -234,19 +232,6 @@ def test_a_marking_under_another_ones_name_is_named_and_left_out():
     assert f"{drawn[wrong].name} left out: its pixels lie on {other.name}" in str(
         result.report.decisions
     )
-
-
-def test_a_fit_without_the_pixels_of_markings_takes_no_mean_of_nothing():
-    camera, rng = people.seat(1)
-    clicked = people.click(camera, rng, count=9).clicked
-    drawn = people.draw(camera, ["touch_line_far", "halfway_line"], rng)
-    both = ClickedMarkings(points=clicked.points, drawn=drawn)
-    settings = StaticCalibrationSettings()
-    problem = build_problem(gather_evidence(PITCH, both, SIZE, 0.5, "test"), SIZE, settings)
-    alone = problem.select(np.ones(9, np.bool_), np.zeros(2, np.bool_))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert fit_inliers(alone, camera.numbers, settings).inliers.all()
 
 
 def test_a_wrong_click_is_found_and_no_other():
