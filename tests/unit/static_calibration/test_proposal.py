@@ -75,7 +75,6 @@ def test_too_little_paint_is_refused_with_what_to_click():
         propose_camera(grass, PITCH, side="near", where="image of cam3")
 
 
-@pytest.mark.slow  # a page shows an unclear proposal with its reason in the fast run
 def test_lines_that_many_cameras_explain_are_not_clear():
     # Two parallels and a line across them: every pair of parallels of the pitch explains them.
     names = ["penalty_area_left_near", "penalty_area_left_far", "penalty_area_left_front"]
