@@ -33,52 +33,45 @@ ORDER_IN_WORLDPOSE = (
 
 
 @functools.cache
-def imported_modules(path):
+def imports(path):
+    """Return the modules (name, part) that a file imports, and what of them, "" = all."""
     found = []
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            found += [alias.name for alias in node.names]
+            found += [(alias.name, "") for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative imports hide the direction"
-            found.append(node.module)
+            found += [(node.module, alias.name) for alias in node.names]
     return found
 
 
-def backward_imports(package, forbidden, root=ROOT):
-    return [
-        f"{path.relative_to(root)} imports {module}"
-        for path in sorted((root / package).rglob("*.py"))
-        for module in imported_modules(path)
-        if module.partition(".")[0] in forbidden
-    ]
+def imported_modules(path):
+    return list(dict.fromkeys(module for module, _ in imports(path)))
 
 
 @pytest.mark.parametrize("package", FORBIDDEN)
 def test_imports_point_one_way(package):
-    assert (ROOT / package).is_dir()
-    assert backward_imports(package, FORBIDDEN[package]) == []
-
-
-def test_every_package_of_worldpose_has_a_place_in_the_order():
-    files = (ROOT / "worldpose").rglob("*.py")
-    found = {path.relative_to(ROOT / "worldpose").parts[0].removesuffix(".py") for path in files}
-    assert found - {"__init__"} == set(ORDER_IN_WORLDPOSE)
-
-
-def later_imports(order, root=ROOT):
-    place = {name: number for number, name in enumerate(order)}
-    return [
-        f"{path.relative_to(root)} imports {module}"
-        for path in sorted((root / "worldpose").rglob("*.py"))
+    files = sorted((ROOT / package).rglob("*.py"))
+    assert files
+    assert [
+        f"{path.relative_to(ROOT)} imports {module}"
+        for path in files
         for module in imported_modules(path)
-        if module.startswith("worldpose.")
-        and place[module.split(".")[1]]
-        > place.get(path.relative_to(root / "worldpose").parts[0].removesuffix(".py"), len(order))
-    ]
+        if module.partition(".")[0] in FORBIDDEN[package]
+    ] == []
 
 
-def test_packages_of_worldpose_import_earlier_ones_only():
-    assert later_imports(ORDER_IN_WORLDPOSE) == []
+def test_packages_of_worldpose_have_a_place_in_the_order_and_import_earlier_ones_only():
+    top = ROOT / "worldpose"
+    files = {path: path.relative_to(top).parts[0].removesuffix(".py") for path in top.rglob("*.py")}
+    assert {*files.values()} - {"__init__"} == {*ORDER_IN_WORLDPOSE}
+    order = {name: number for number, name in enumerate((*ORDER_IN_WORLDPOSE, "__init__"))}
+    assert [
+        f"{path.relative_to(ROOT)} imports {module}"
+        for path, package in files.items()
+        for module in imported_modules(path)
+        if module.startswith("worldpose.") and order[module.split(".")[1]] > order[package]
+    ] == []
 
 
 def test_only_the_object_store_module_reaches_for_the_network_library():
@@ -133,15 +126,7 @@ def module_imports(root, packages):
         for package in packages
         for path in (root / package).rglob("*.py")
     }
-    taken = {
-        name: [
-            (node.module, alias.name) if isinstance(node, ast.ImportFrom) else (alias.name, "")
-            for node in ast.walk(ast.parse(path.read_text()))
-            if isinstance(node, ast.Import | ast.ImportFrom)
-            for alias in node.names
-        ]
-        for name, path in files.items()
-    }
+    taken = {name: imports(path) for name, path in files.items()}
 
     def definer(module, name, importer):
         if f"{module}.{name}" in files:

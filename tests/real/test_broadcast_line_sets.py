@@ -4,10 +4,11 @@ WORLDPOSE_TEST_DATA names a folder with `wc14` (lines.json, calib_eval.py).
 """
 
 import numpy as np
+import pytest
 from line_sets import SIZE, cameras_of_key_frames, jaccards, key_frame_lines, load_scorer
 from real_data import GIVEN, needs
 
-pytestmark = needs("wc14")
+pytestmark = [needs("wc14"), pytest.mark.slow]  # the clip with clicked key frames is faster
 
 
 def test_one_drawn_frame_gives_a_main_camera_in_a_main_stand():

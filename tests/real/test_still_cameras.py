@@ -1,16 +1,11 @@
 """Labels of real stills, and cameras that are calibrated from them without a click."""
 
-import sys
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
-import stills
 from real_data import GIVEN, needs
 
 from worldpose.pitch.template import PitchTemplate
-from worldpose.training.labels import read_labels
 
 DATA = GIVEN / "still_cameras"
 MIDFIELD, AREA = "che0", "var9"
@@ -46,23 +41,3 @@ def test_a_real_still_is_calibrated_without_a_click(bench, name):
     score = bench.score_still(np.ascontiguousarray(picture[..., ::-1]), still)
     assert score.accepted
     assert score.jaccard[0] == 1.0
-
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-
-
-@pytest.fixture(scope="module")
-def labels():
-    return read_labels(stills.LABELS)
-
-
-def test_the_labels_cover_what_the_table_states(labels):
-    assert {still.path.name for still in labels} == set(stills.STILLS)
-    outlines = stills.pitch_outlines(stills.LABELS)
-    assert set(outlines) == set(stills.STILLS)
-    people = [still.boxes[~still.ignored] for still in labels]
-    assert sum(map(len, people)) == 149
-    joints = np.concatenate([still.visible for still in labels])
-    assert (joints[:, :5] == 0).all()  # no face was labelled
-    assert ((joints > 0).sum(axis=1) > 0).sum() == 74
-    assert (joints == 2).sum() >= 690

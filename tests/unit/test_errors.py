@@ -179,15 +179,10 @@ def tree(tmp_path):
 
 
 def version_of(tree):
-    forget()
-    return code_version("tasks.tracking", (tree,))
-
-
-def forget():
     """Read sources again, as a new process would."""
-    code_version.cache_clear()
-    _read_module.cache_clear()
-    _source_cache.cache_clear()
+    for cache in (code_version, _read_module, _source_cache):
+        cache.cache_clear()
+    return code_version("tasks.tracking", (tree,))
 
 
 def edited(tree, name, old, new):

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from camera_builders import plain_camera
-from walking_bodies import KEYPOINTS, MODEL, seen, walker
+from walking_bodies import KEYPOINTS, MODEL, panning_camera, seen, walker
 
 from worldpose.body.model import BodyParameters
 from worldpose.body_fitting.estimate import fit_bodies
@@ -22,7 +21,6 @@ from worldpose.errors import InputError
 from worldpose.geometry.rigid import Rigid
 from worldpose.simulation.detector_errors import MonocularErrors, estimate_bodies
 
-ONE = np.ones((1, 1))
 VECTORS = np.random.default_rng(0).normal(0.0, 0.4, (3, 24, 3))
 MATRICES = Rigid.from_rotvec(VECTORS, np.zeros(3)).rotation
 CROP = {"box_center": np.array([[10.0, 20.0], [30.0, 40.0], [50.0, 60.0]])}
@@ -105,18 +103,6 @@ def test_boxes_with_scores_and_classes_or_of_nobody_and_frames_as_text_are_read(
 EXACT = MonocularErrors(turn=0.0, facing=0.0, size=0.0, place=0.0, missed=0.0)
 
 
-def broadcast(frames):
-    """A camera 70 m beside the pitch, 15 m up, that pans past the origin."""
-    pan = np.linspace(-0.12, 0.12, frames)
-    down = np.arctan2(15.0, 70.0)
-    x = np.stack([np.cos(pan), np.sin(pan), 0.0 * pan], axis=-1)
-    ahead = np.stack([-np.sin(pan), np.cos(pan), 0.0 * pan], axis=-1)
-    z = np.cos(down) * ahead - np.sin(down) * np.array([0.0, 0.0, 1.0])
-    rotation = np.stack([x, np.cross(z, x), z], axis=-2)
-    center = np.array([0.0, -70.0, 15.0])
-    return plain_camera(4000.0, (959.5, 539.5), Rigid(rotation, -(rotation @ center)))
-
-
 def crowd(frames):
     """Three walkers 3 m apart (frames, 3)."""
     rng = np.random.default_rng(3)
@@ -136,7 +122,7 @@ def estimates(bodies, camera, errors=EXACT, seed=0):
 
 
 def test_exact_bodies_of_crops_come_back_in_the_world_at_their_persons():
-    bodies, camera = crowd(6), broadcast(6)
+    bodies, camera = crowd(6), panning_camera(6)
     joints = KEYPOINTS(bodies)
     found = place_monocular_poses(estimates(bodies, camera), camera, np.arange(6), joints)
     true = Rigid.from_rotvec(bodies.global_orient, np.zeros(3)).rotation
@@ -161,26 +147,15 @@ def test_a_person_has_the_pose_of_the_camera_that_shows_it_largest():
     assert join_poses([]) is None
 
 
-def people_in_a_gap(seed=5):
-    """A walker whose limbs are not triangulated for one second, and the true bodies."""
-    rng = np.random.default_rng(seed)
+def test_right_glimpses_help_where_joints_are_missing_and_are_recorded():
+    """The limbs of a walker are not triangulated for one second."""
+    rng, settings = np.random.default_rng(5), BodyFittingSettings()
     truth = walker(100, rng)
     joints, covariance = seen(truth, 0.01, rng)
-    joints[30:80, :, 7:11] = np.nan
-    joints[30:80, :, 13:17] = np.nan
-    return truth, joints, covariance
-
-
-def glimpsed(truth, error, rng):
-    orient = rotation(truth.global_orient)[:, None]
-    angles = (truth.body_pose @ GATHER.T)[:, None]
-    return MonocularPoses(orient, angles + error * rng.standard_normal(angles.shape), ONE)
-
-
-def test_right_glimpses_help_where_joints_are_missing_and_are_recorded():
-    truth, joints, covariance = people_in_a_gap()
-    settings = BodyFittingSettings()
-    glimpses = glimpsed(truth, 0.1, np.random.default_rng(1))
+    joints[30:80, :, [*range(7, 11), *range(13, 17)]] = np.nan
+    orient, angles = rotation(truth.global_orient)[:, None], (truth.body_pose @ GATHER.T)[:, None]
+    angles = angles + 0.1 * np.random.default_rng(1).standard_normal(angles.shape)
+    glimpses = MonocularPoses(orient, angles, np.ones((1, 1)))
     alone = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), settings)
     guided = fit_bodies(
         MODEL, ClipEvidence(joints, covariance, 50.0, monocular_poses=glimpses), settings

@@ -1,12 +1,14 @@
 """Open bodies that walk, as truth for fits."""
 
 import numpy as np
+from camera_builders import plain_camera
 
 from data_contracts.conventions import COCO17
 from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BODY_POSE, BodyParameters
 from worldpose.body_fitting.pose_space import SPREAD, load_pose_prior
+from worldpose.geometry.rigid import Rigid
 
 MODEL = load_open_body()
 KEYPOINTS = fold_keypoints(MODEL, COCO17)
@@ -40,3 +42,15 @@ def seen(parameters, noise, rng):
     joints = joints + std * rng.standard_normal(joints.shape)
     spread = np.maximum(std, 0.005)[..., None] ** 2 * np.eye(3)
     return joints, np.broadcast_to(spread, (*joints.shape, 3)).copy()
+
+
+def panning_camera(frames, pan=(-0.12, 0.12), center=(0.0, -70.0, 15.0), focal=4000.0, aim=0.0):
+    """A camera in a stand that pans by angles [rad] past a point above the origin [m]."""
+    pan, center = np.linspace(*pan, frames), np.array(center)
+    down = np.arctan2(center[2] - aim, -center[1])
+    x = np.stack([np.cos(pan), np.sin(pan), 0.0 * pan], axis=-1)
+    ahead = np.stack([-np.sin(pan), np.cos(pan), 0.0 * pan], axis=-1)
+    z = np.cos(down) * ahead - np.sin(down) * np.array([0.0, 0.0, 1.0])
+    rotation = np.stack([x, np.cross(z, x), z], axis=-2)
+    pose = Rigid(rotation, -(rotation @ center))
+    return plain_camera(np.full(frames, focal), (959.5, 539.5), pose)

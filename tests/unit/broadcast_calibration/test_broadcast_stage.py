@@ -11,19 +11,15 @@ from data_contracts.body_fitting import BODY_FITTING
 from data_contracts.broadcast_calibration import FRAME_STATUS, KeyFrame, KeyFrames
 from data_contracts.bundle_adjustment import BUNDLE_ADJUSTMENT
 from data_contracts.keypoints import KeypointDetections
-from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from flows.registering import register
-from flows.reports.match_pictures import frame_pictures
 from flows.run_plan import plan_run
 from flows.stages.broadcast_calibration import uncalibrated_warnings
 from tasks.broadcast_calibration import broadcast_calibration, broadcast_pooling
 from tasks.ingest import ingest
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.pan_tilt import camera_angles
-from worldpose.ingest.footage import write_still
 from worldpose.ingest.writing import MatchAnnotations, write_match
 from worldpose.store.store import Store
 from worldpose.video.files import write_video
@@ -176,6 +172,7 @@ def test_the_task_publishes_a_camera_for_every_frame_of_the_clip(calibrated):
     assert result["frame"].values.tolist() == list(range(FIRST, FIRST + COUNT))
     # Frame 15 of the video is none of the clip's.
     assert result.attrs["key_frames"] == [9]
+
     assert FRAME_STATUS[int(result["status"].sel(frame=FIRST + 5))] == "key_frame"
     assert all(4 <= number < 4 + COUNT for number in result.attrs["pick_next"])
     true = clip.moving(VIDEO, pan=(-2.0, 6.0)).frames(np.arange(4, 4 + COUNT))
@@ -186,7 +183,9 @@ def test_the_task_publishes_a_camera_for_every_frame_of_the_clip(calibrated):
     # What match.yaml says of the clock is right, and people were taken accordingly.
     offset = result.attrs["feed_offset"]
     assert offset["frames"] == pytest.approx(0.0, abs=0.3)
-    figures = store.manifest("stage", "broadcast_calibration", "goal", unit.key).figures
+    manifest = store.manifest("stage", "broadcast_calibration", "goal", unit.key)
+    assert "key frames 15 are outside of the clip's 4 to 13" in str(manifest.warnings)
+    figures = manifest.figures
     assert figures["feed_offset_frames"] == offset["frames"]
     assert figures["weak"] == float(bool(result.attrs["reasons"]))
 
@@ -227,59 +226,13 @@ def test_a_camera_of_another_rate_is_that_of_the_image_nearest_to_each_frame(cal
     assert result.attrs["feed_offset"]["frames"] == pytest.approx(0.0, abs=0.3)
 
 
-@pytest.mark.slow
-def test_images_are_those_of_the_clock_and_only_key_frames_of_the_clip_count(tmp_path):
-    """A recorder dropped image 6; the key frame is behind the clip, and camera data suffice."""
-    true, (width, height) = clip.moving(VIDEO, pan=(-2.0, 6.0)), clip.SIZE
-    key = KeyFrames(key_frames=(KeyFrame(frame=14, markings=clicks(true, 14)),))
-    seen = np.full((VIDEO, 1, 17, 2), 100.0) + np.arange(17)[:, None]
-
-    def files(draft):
-        (draft / "frames").mkdir()
-        for number, image in enumerate(clip.film_empty_pitch(true.camera, 5)):
-            if number != 6:
-                write_still(draft / "frames" / f"{number:03d}.png", image)
-        table = np.column_stack([*camera_angles(true.camera), true.focal])
-        rows = (",".join(map(str, [n, *row, *true.center])) for n, row in enumerate(table))
-        (draft / "estimates").mkdir()
-        data = "\n".join(["frame,pan,tilt,roll,focal_px,x_m,y_m,z_m", *rows])
-        (draft / "estimates" / "goal.csv").write_text(data)
-
-    def write(count):
-        main = CameraSpec(id="main", kind="broadcast", width=width, height=height, video="frames")
-        goal = ClipSpec(id="goal", frame_count=count, broadcast="main")
-        spec = MatchSpec(match_id="gap", fps=FPS, cameras=(main,), clips=(goal,))
-        told = MatchAnnotations(key_frames={"goal": key})
-        path = tmp_path / f"{count}"
-        write_match(
-            path,
-            spec,
-            calibrations={},
-            observations={"goal": observed(np.arange(VIDEO), seen)},
-            pitch=PitchSpec(),
-            annotations=told,
-            further=files,
-        )
-        return path
-
-    store = Store.create(tmp_path / "project")
-    with pytest.raises(InputError, match=r"0 to 15, found 0 to 19.* the 16 frames that fit"):
-        register(store, write(20))
-    match, _ = register(store, write(12))
-    shown = frame_pictures(store, match, "goal", range(4, 9))
-    assert [image is None for image in shown] == [False, False, True, False, False]
-    planned = {unit.name: unit for unit in plan_run(store, match, {})}
-    ingest.fn(planned["ingest/goal"].work(store.url, match, "0001"))
-    work = planned["broadcast_calibration/goal"]
-    broadcast_calibration.fn(work.work(store.url, match, "0001"))
-    result = store.open_result("gap", "broadcast_calibration", "goal", work.key)
-    turn = result["rotation"].values @ np.swapaxes(true.rotation[:12], 1, 2)
-    off = np.degrees(np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1.0) / 2.0, -1.0, 1.0)))
-    # An image is half a degree on.
-    assert off.max() < 0.1
-    assert (result["marking_count"].values > 30).nonzero()[0].tolist() == [*range(6), *range(7, 12)]
-    warnings = store.manifest("gap", "broadcast_calibration", "goal", work.key).warnings
-    assert "key frames 14 are outside of the clip's 0 to 11" in warnings[0]
+def test_a_clip_that_is_longer_than_its_video_is_refused(folder, tmp_path):
+    match = shutil.copytree(folder, tmp_path / "stage")
+    text = (match / "match.yaml").read_text()
+    assert f"frame_count: {COUNT}" in text
+    (match / "match.yaml").write_text(text.replace(f"frame_count: {COUNT}", "frame_count: 20"))
+    with pytest.raises(InputError, match=r"0 to 15, found .* frames that fit"):
+        register(Store.create(tmp_path / "project"), match)
 
 
 def test_static_work_of_a_clip_is_planned_once_for_all_its_broadcast_cameras(calibrated):

@@ -206,9 +206,7 @@ def test_the_offset_of_a_faster_camera_is_in_match_frames(rate, late):
     clock = ImageClock.of(frames, 0.0, rate, 0.0)
     camera, exact = people(late * rate, 5.0, rng)
     # What static cameras of this lower rate triangulate, with the noise of single frames.
-    joints = exact.joints[(frames * rate).astype(int)] if rate == 2.0 else None
-    if joints is None:
-        joints = rows_at(exact.joints, frames * rate)
+    joints = rows_at(exact.joints, frames * rate)
     joints = joints + 0.04 * rng.standard_normal(joints.shape)
     moving = People.in_images(joints, exact.keypoints[clock.number], FPS / rate, clock)
     images = np.arange(len(clock.images))
@@ -218,34 +216,18 @@ def test_the_offset_of_a_faster_camera_is_in_match_frames(rate, late):
     assert (found.frames, found.rate) == pytest.approx((late, rate), abs=0.15)
 
 
-def test_clips_that_agree_give_their_weighted_mean():
+def test_clips_that_agree_give_their_weighted_mean_and_those_of_two_places_none():
     wide, narrow = 4.0 * np.eye(3), np.eye(3)
-    pooled = pool_centers(
-        [np.array([0.0, -70.0, 15.0]), np.array([1.0, -70.0, 15.0])], [wide, narrow]
-    )
+    places = [np.array([x, -70.0, 15.0]) for x in (0.0, 1.0, 10.0)]
+    pooled = pool_centers(places[:2], [wide, narrow])
     assert pooled.agree
     # Weights of 1/4 and 1.
     np.testing.assert_allclose(pooled.center, [0.8, -70.0, 15.0])
     np.testing.assert_allclose(pooled.covariance, 0.8 * np.eye(3))
-
-
-def test_clips_of_two_places_are_not_pooled():
-    pooled = pool_centers([np.zeros(3), np.array([10.0, 0.0, 0.0])], [np.eye(3), np.eye(3)])
-    assert not pooled.agree
-    assert np.isnan(pooled.center).all()
+    apart = pool_centers(places[::2], [narrow, narrow])
+    assert not apart.agree and np.isnan(apart.center).all()
     # Half of ten to either side.
-    np.testing.assert_allclose(pooled.distance, [5.0, 5.0])
-
-
-SMOOTH = np.array([np.inf] * 3 + [1e-4])
-
-
-def problem_of(true, rng, frames=None, noise=0.3, smooth=SMOOTH):
-    points = clip.ground_points(true, rng, noise=noise)
-    if frames is not None:
-        points = points[np.isin(points.frame, frames)]
-    prior = build_prior(BroadcastPrior(), true.focal, true.image_size)
-    return ClipProblem(points, clip.followed_points(true, rng), prior, smoothness=smooth)
+    np.testing.assert_allclose(apart.distance, [5.0, 5.0])
 
 
 def off(true, rng):
@@ -254,21 +236,18 @@ def off(true, rng):
     return true.take_step(step, [0.4, -0.5, 0.3, 3.0, 2.0])
 
 
-def bearing_error(camera, true):
-    pixels = np.array([[100.0, 100.0], [480.0, 270.0], [860.0, 440.0]])
-    one, two = (each.camera.unproject(pixels).directions for each in (camera, true))
-    return np.degrees(np.linalg.norm(one - two, axis=-1))
-
-
 def test_exact_evidence_gives_the_exact_camera():
     rng = np.random.default_rng(1)
     true = clip.moving(20)
-    problem = problem_of(true, rng, noise=1e-6, smooth=np.full(4, np.inf))
-    problem = replace(problem, flow=FlowEvidence.none())
+    points = clip.ground_points(true, rng, noise=1e-6)
+    prior = build_prior(BroadcastPrior(), true.focal, true.image_size)
+    problem = ClipProblem(points, FlowEvidence.none(), prior, smoothness=np.full(4, np.inf))
     found = solve(off(true, rng), problem, 60).camera
     # A prior of pixels against evidence of 1e-6 px.
     np.testing.assert_allclose(found.center, true.center, atol=1e-3)
-    assert np.median(bearing_error(found, true)) < 1e-5
+    pixels = np.array([[100.0, 100.0], [480.0, 270.0], [860.0, 440.0]])
+    one, two = (each.camera.unproject(pixels).directions for each in (found, true))
+    assert np.degrees(np.median(np.linalg.norm(one - two, axis=-1))) < 1e-5
 
 
 def test_a_frame_with_neither_evidence_nor_prior_is_named_as_undetermined():

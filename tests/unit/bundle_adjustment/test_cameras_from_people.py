@@ -50,33 +50,28 @@ def cameras(walkers):
     for n, angle in enumerate(np.radians([20.0, 110.0, 215.0, 300.0])):
         far = reach + 5.0 + 0.7 * n
         center = (far * np.cos(angle), far * np.sin(angle), 1.5 + 0.5 * n)
-        found.append(
-            look_at_camera(
-                *(center, (0.0, 0.0, 0.9), FOCAL, SIZE),
-                middle=(640.0 + n, 470.0 + n),
-                lens=(-0.05, 0.01, 0.0, 0.0, 0.0),
-                roll=0.02 * n,
-            )
-        )
+        about = {"middle": (640.0 + n, 470.0 + n), "lens": (-0.05, 0.01, 0.0, 0.0, 0.0)}
+        found.append(look_at_camera(center, (0.0, 0.0, 0.9), FOCAL, SIZE, roll=0.02 * n, **about))
     return Camera.stack(found)
 
 
-def lens(camera, name, focal_std=2.0, focal=None):
-    return LensCalibration(
-        id=name,
-        image_size=SIZE,
-        focal_px=float(camera.focal[0]) if focal is None else focal,
-        principal_point_px=tuple(camera.principal_point.tolist()),
-        distortion=tuple(camera.coefficients.tolist()),
-        lens_model=LensModel(int(camera.lens_model)).label,
-        focal_std_px=focal_std,
-        principal_point_std_px=2.0,
-        distortion_std=0.005,
-    )
-
-
-def lenses(cameras, **about):
-    return [lens(cameras[c], name, **about) for c, name in enumerate(NAMES[: len(cameras.focal)])]
+def lenses(cameras, names=NAMES):
+    return [
+        LensCalibration(
+            id=name,
+            image_size=SIZE,
+            focal_px=float(camera.focal[0]),
+            principal_point_px=tuple(camera.principal_point.tolist()),
+            distortion=tuple(camera.coefficients.tolist()),
+            lens_model=LensModel(int(camera.lens_model)).label,
+            focal_std_px=2.0,
+            principal_point_std_px=2.0,
+            distortion_std=0.005,
+        )
+        for name, camera in zip(
+            names, (cameras[c] for c in range(len(cameras.focal))), strict=False
+        )
+    ]
 
 
 def seen(cameras, joints, noise=1.5):
@@ -109,14 +104,8 @@ def test_a_walking_person_locates_four_cameras_in_metres(walkers, cameras, fishe
     assert off.max() < 0.05
     assert (off < 4.0 * found.std[:, 0] + 0.02).all()
     turned = found.cameras.cam_from_world.rotation @ motion.rotation.T
-    angle = np.arccos(
-        np.clip(
-            0.5 * (np.einsum("cij,cij->c", turned, cameras.cam_from_world.rotation) - 1.0),
-            -1.0,
-            1.0,
-        )
-    )
-    assert np.degrees(angle).max() < 0.5
+    cosine = 0.5 * (np.einsum("cij,cij->c", turned, cameras.cam_from_world.rotation) - 1.0)
+    assert np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).max() < 0.5
     # The world's z is up, its origin on the ground.
     tilt = np.arccos(np.clip((motion.rotation @ [0.0, 0.0, 1.0])[2], -1.0, 1.0))
     assert tilt < max(3.0 * found.up_std, np.radians(1.0))
@@ -187,7 +176,7 @@ def test_groups_that_show_different_people_are_named(walkers, cameras):
     both = KeypointDetections.from_keypoints(
         keypoints, np.where(np.isfinite(keypoints[..., 0]), 0.9, np.nan)
     )
-    halls = [lens(cameras[c], f"{hall}{c}") for hall in "ab" for c in range(4)]
+    halls = [one for hall in "ab" for one in lenses(cameras, [f"{hall}{c}" for c in range(4)])]
     with pytest.raises(InputError, match="2 groups that share no person: a0, a1, a2, a3; b0, b1"):
         locate_cameras(halls, both, FPS, KnownLength(1.8))
 
@@ -195,14 +184,13 @@ def test_groups_that_show_different_people_are_named(walkers, cameras):
 QUICK = BundleAdjustmentSettings(max_frames=8, folds=2, solver=SolverSettings(min_cost_change=1e-6))
 
 
-@pytest.mark.parametrize(("noise", "share"), [(1.0, 0.4), (0.0, 0.45)])
-def test_people_bring_cameras_together(clip, noise, share):
-    made, true, _ = clip(noise=noise)
+def test_people_bring_cameras_together(clip):
+    made, true, _ = clip()
     adjusted = adjust_cameras(made, QUICK)
     assert adjusted.accepted.all()
     # Scatter of a pixel's rotation and of decimetres becomes what 800 keypoints per camera leave;
-    # what all cameras share stays as calibration has it. Seen without noise: 0.43.
-    assert errors(adjusted.cameras, true).mean() < share * errors(made.cameras, true).mean()
+    # what all cameras share stays as calibration has it.
+    assert errors(adjusted.cameras, true).mean() < 0.4 * errors(made.cameras, true).mean()
     assert (adjusted.verdict.loss[:, 1] < adjusted.verdict.loss[:, 0]).all()
     assert all(reason.startswith("accepted") for reason in adjusted.reasons)
 
@@ -237,23 +225,13 @@ def test_covariance_covers_the_error(clip):
 
 def test_markings_alone_are_refused_where_they_bend_the_camera(clip):
     made, true, _ = clip(clicked=6, seed=2)
-    clustered = []
-    for clicks in made.clicks:
+    rng, clustered = np.random.default_rng(5), []
+    for c, clicks in enumerate(made.clicks):
         # All in a tenth of the pitch: the lens is free to do anything elsewhere.
         near = 0.3 * clicks.points_world + [14.0, 14.0, 0.0]
-        clustered.append(near)
-    rng = np.random.default_rng(5)
-    made = replace(
-        made,
-        clicks=tuple(
-            replace(
-                clicks,
-                points_world=near,
-                points_image=true[c].project(near) + 1.5 * rng.standard_normal((6, 2)),
-            )
-            for c, (clicks, near) in enumerate(zip(made.clicks, clustered, strict=True))
-        ),
-    )
+        pixels = true[c].project(near) + 1.5 * rng.standard_normal((6, 2))
+        clustered.append(replace(clicks, points_world=near, points_image=pixels))
+    made = replace(made, clicks=tuple(clustered))
     adjusted = adjust_cameras(made, QUICK.model_copy(update={"evidence": "markings"}))
     assert errors(adjusted.refused, true).max() > 2.0 * errors(made.cameras, true).max()
     assert not adjusted.accepted.any()
@@ -262,28 +240,34 @@ def test_markings_alone_are_refused_where_they_bend_the_camera(clip):
     assert all(reason.startswith("refused: the loss of") for reason in adjusted.reasons)
 
 
+NOBODY = "no person has enough inlier cameras"
+
+
 @pytest.mark.parametrize(
-    "case", ["nobody", "no frames", "one camera", "two cameras in line", "no markings"]
+    ("size", "change", "evidence", "reason"),
+    [
+        ({"frames": 6}, lambda m: {"joints": np.full_like(m.joints, np.nan)}, "people", NOBODY),
+        (
+            {"frames": 6},
+            lambda m: {n: getattr(m, n)[:0] for n in ("detections", "joints", "views")},
+            *("people", NOBODY),
+        ),
+        ({"cameras": 1}, lambda _: {}, "people", NOBODY),
+        ({"cameras": 2}, lambda _: {}, "people", NOBODY),
+        (
+            {"frames": 6},
+            lambda m: {"clicks": (Clicks.none(),) * len(m.clicks)},
+            *("markings", "no camera has a clicked marking"),
+        ),
+    ],
+    ids=["nobody", "no frames", "one camera", "two cameras in line", "no markings"],
 )
-def test_what_tells_nothing_leaves_cameras_as_they_were_and_says_why(clip, case):
-    if case == "one camera":
-        made, *_ = clip(cameras=1)
-    elif case == "two cameras in line":
-        made, *_ = clip(cameras=2)
-    else:
-        made, *_ = clip(frames=6)
-    settings, reason = QUICK, "no person has enough inlier cameras"
-    if case == "nobody":
-        made = replace(made, joints=np.full_like(made.joints, np.nan))
-    if case == "no frames":
-        seen, joints, views = made.detections[:0], made.joints[:0], made.views[:0]
-        made = replace(made, detections=seen, joints=joints, views=views)
-    if case == "no markings":
-        count = len(made.clicks)
-        made = replace(made, clicks=(Clicks.none(),) * count)
-        settings = QUICK.model_copy(update={"evidence": "markings"})
-        reason = "no camera has a clicked marking"
-    adjusted = adjust_cameras(made, settings)
+def test_what_tells_nothing_leaves_cameras_as_they_were_and_says_why(
+    clip, size, change, evidence, reason
+):
+    made, *_ = clip(**size)
+    settings = QUICK if evidence == "people" else QUICK.model_copy(update={"evidence": evidence})
+    adjusted = adjust_cameras(replace(made, **change(made)), settings)
     assert not adjusted.accepted.any()
     np.testing.assert_array_equal(adjusted.cameras.numbers, made.cameras.numbers)
     assert all(reason in said for said in adjusted.reasons)
@@ -398,20 +382,6 @@ def placed_again(clip):
     return replace(clip, joints=placed.joints, views=placed.views.astype(np.int64))
 
 
-@pytest.fixture
-def honest(clip):
-    """A clip of eight cameras, the true ones, and the errors that adjustment leaves them."""
-    made, true, _ = clip(cameras=8, seed=3)
-    # Calibrations of one or two pixels, not of ten: three views or more agree about every joint.
-    covariance = 0.02 * made.covariance
-    spread = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    step = spread * np.random.default_rng(7).standard_normal((8, 12))
-    made = placed_again(replace(made, cameras=step_camera(true, step), covariance=covariance))
-    adjusted = adjust_cameras(made, QUICK_CHECK)
-    assert adjusted.accepted.all()
-    return made, true, errors(adjusted.cameras, true)
-
-
 def test_well_calibrated_cameras_stay_unless_the_change_is_beyond_chance(clip):
     made, true, _ = clip(cameras=8, seed=3)
     exact = placed_again(replace(made, cameras=true, covariance=1e-4 * made.covariance))
@@ -426,15 +396,19 @@ def test_well_calibrated_cameras_stay_unless_the_change_is_beyond_chance(clip):
     assert adjusted.evidence.shift > 0.0  # that of the proposed change
 
 
-def test_a_camera_calibrated_wrong_is_mended_and_the_others_hardly_feel_it(honest):
-    made, true, clean = honest
+def test_a_camera_calibrated_wrong_is_mended_and_the_others_hardly_feel_it(clip):
+    made, true, _ = clip(cameras=8, seed=3)
+    # Calibrations of one or two pixels, not of ten: three views or more agree about every joint.
+    covariance = 0.02 * made.covariance
+    spread = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    step = spread * np.random.default_rng(7).standard_normal((8, 12))
+    made = replace(made, cameras=step_camera(true, step), covariance=covariance)
     step = np.zeros((8, 12))
     step[WRONG, 1] = 0.02  # 40 px, two hundred times what its calibration states
-    adjusted = adjust_cameras(
-        placed_again(replace(made, cameras=step_camera(made.cameras, step))), QUICK_CHECK
-    )
-    assert adjusted.accepted.all()
-    left = errors(adjusted.cameras, true)
+    wrong = replace(made, cameras=step_camera(made.cameras, step))
+    honest, mended = (adjust_cameras(placed_again(each), QUICK_CHECK) for each in (made, wrong))
+    assert honest.accepted.all() and mended.accepted.all()
+    clean, left = (errors(each.cameras, true) for each in (honest, mended))
     # It had a say in where the world is: without it the others lose an eighth of their knowledge.
     assert np.delete(left, WRONG).mean() < 1.25 * np.delete(clean, WRONG).mean()
     # A hundredth of what it was, and more than the others': people alone place it.

@@ -193,7 +193,8 @@ def test_a_wrong_world_is_no_fault_of_its_cameras(change):
 def test_a_wrong_clock_or_frame_rate_is_named(frames, kind, value):
     cameras = rig()
     keypoints = seen(cameras, walkers())
-    keypoints[:, 2] = shifted(keypoints[:, 2], frames)
+    shown = (frames >= 0) & (frames < FRAMES)
+    keypoints[shown, 2], keypoints[~shown, 2] = keypoints[frames[shown], 2], np.nan
     result = check(cameras, keypoints)
     assert named(result) == [(2, kind)]
     assert result.faults[0].value == pytest.approx(value, abs=1)
@@ -242,14 +243,6 @@ def test_a_calibration_error_within_its_covariance_is_no_fault():
     covariance = np.full((5, 12, 12), np.nan)
     covariance[1] = np.diag([1e-6] * 3 + [1e-4] * 3 + [0.02**2] + [0.0] * 5)
     assert check(cameras, keypoints, covariance).faults == ()
-
-
-def shifted(keypoints, frames):
-    """A camera's detections that show frame `frames[t]` in frame t."""
-    inside = (frames >= 0) & (frames < len(keypoints))
-    out = np.full_like(keypoints, np.nan)
-    out[inside] = keypoints[frames[inside]]
-    return out
 
 
 def test_four_coefficients_of_a_fisheye_read_as_browns_are_a_hypothesis():

@@ -27,16 +27,18 @@ from worldpose.detection.bundled_pose import (
 )
 from worldpose.detection.enlargement import expect_parts, find_small
 from worldpose.detection.interfaces import People
-from worldpose.detection.models import BUNDLED_WEIGHTS, load_bundled_detector, load_bundled_pose
+from worldpose.detection.models import (
+    BUNDLED_WEIGHTS,
+    LANDMARK_WEIGHTS,
+    load_bundled_detector,
+    load_bundled_pose,
+)
 from worldpose.detection.net_inference import QuantizedNet, run_together
 from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError
 from worldpose.geometry.boxes import box_iou
 from worldpose.ingest.registration import digest_of_files
 from worldpose.pitch.template import PitchTemplate
-from worldpose.simulation.matches import MatchOptions, simulate_match
-from worldpose.simulation.scenarios import SCENARIOS
-from worldpose.training.labels import read_picture
 
 
 def shaken(net):
@@ -135,26 +137,21 @@ def test_joints_are_the_peaks_that_a_search_over_all_cells_finds(kind):
         np.testing.assert_allclose(places[one][:count], said, atol=1e-3)
 
 
-@pytest.mark.parametrize("which", [0, 1])
-def test_nets_in_integers_are_of_the_shipped_weights(which):
-    net = QuantizedNet(BUNDLED_WEIGHTS[which].with_suffix(".onnx"))
-    assert net.weights_sha256 == digest_of_files(BUNDLED_WEIGHTS[which])
+@pytest.mark.parametrize("weights", [*BUNDLED_WEIGHTS, LANDMARK_WEIGHTS], ids=lambda p: p.stem)
+def test_nets_in_integers_are_of_the_shipped_weights(weights):
+    net = QuantizedNet(weights.with_suffix(".onnx"))
+    assert net.weights_sha256 == digest_of_files(weights)
 
 
-def test_nets_in_integers_see_what_they_see_in_floating_point(tmp_path):
-    options = MatchOptions(duration=0.04, cameras=2, video=False)
-    simulate_match(SCENARIOS["tiny"], 5, tmp_path / "tiny", options)
-    image = read_picture(sorted((tmp_path / "tiny" / "stills").iterdir())[0])
-    exact = load_bundled_detector(BUNDLED_WEIGHTS[0]).detect([image])[0]
-    found = load_bundled_detector().detect([image])[0]
+def test_nets_in_integers_see_what_they_see_in_floating_point(still):
+    exact = load_bundled_detector(BUNDLED_WEIGHTS[0]).detect([still])[0]
+    found = load_bundled_detector().detect([still])[0]
     sure = [people.boxes[people.scores >= 0.4] for people in (exact, found)]
     assert len(sure[0]) == len(sure[1]) >= 4
     overlap = box_iou(*sure)
     assert overlap.max(axis=1).min() > 0.9 and overlap.max(axis=0).min() > 0.9
-    poses = [
-        load_bundled_pose(weights).estimate(image, sure[0])
-        for weights in (BUNDLED_WEIGHTS[1], None)
-    ]
+    estimators = map(load_bundled_pose, (BUNDLED_WEIGHTS[1], None))
+    poses = [each.estimate(still, sure[0]) for each in estimators]
     known = poses[0].confidence > 0.5
     moved = np.linalg.norm(poses[1].keypoints - poses[0].keypoints, axis=-1)[known]
     tall = sure[0][:, 3] - sure[0][:, 1]
@@ -171,28 +168,19 @@ def test_weights_come_back_and_give_equal_bytes(tmp_path):
     assert file.read_bytes() == first
 
 
-def _tensors(net, change):
-    tensors = {name: value.contiguous() for name, value in net.state_dict().items()}
-    change(tensors)
-    return tensors
-
-
-def _poison(tensors):
-    tensors["head.1.bias"] = tensors["head.1.bias"] * float("nan")
-
-
-def _cut_off(tensors):
-    tensors["head.1.bias"] = tensors["head.1.bias"][:-1].contiguous()
-
-
-def _stranger(tensors):
-    tensors["more"] = torch.zeros(1)
-
-
-@pytest.mark.parametrize("change", [_poison, _cut_off, _stranger])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda bias: {"head.1.bias": bias * float("nan")},
+        lambda bias: {"head.1.bias": bias[:-1].contiguous()},
+        lambda bias: {"more": torch.zeros(1)},
+    ],
+    ids=["poisoned", "cut off", "a stranger"],
+)
 def test_weights_with_other_content_are_refused(tmp_path, change):
-    file = tmp_path / "people.safetensors"
-    file.write_bytes(save(_tensors(PeopleNet(), change), {FORMAT: "PeopleNet"}))
+    file, tensors = tmp_path / "people.safetensors", PeopleNet().state_dict()
+    tensors = {name: value.contiguous() for name, value in tensors.items()}
+    file.write_bytes(save(tensors | change(tensors["head.1.bias"]), {FORMAT: "PeopleNet"}))
     with pytest.raises(InputError, match=r"people\.safetensors"):
         load_weights(file, PeopleNet())
 
@@ -204,21 +192,17 @@ def test_files_that_are_no_weights_are_refused_and_run_nothing(tmp_path):
         def __reduce__(self):
             return open, (str(trap), "w")
 
-    torch.save({"net": Trap()}, file)
-    with pytest.raises(InputError, match="cannot be read"):
-        load_weights(file, PeopleNet())
+    for write, told in (
+        (lambda: None, "no file"),
+        (lambda: torch.save({"net": Trap()}, file), "cannot be read"),
+        (lambda: file.write_bytes(b""), "cannot be read"),
+        (lambda: save_weights(file, KeypointNet()), "weights of KeypointNet"),
+        (lambda: file.write_bytes(save(PeopleNet().state_dict())), "weights of something else"),
+    ):
+        write()
+        with pytest.raises(InputError, match=told):
+            load_weights(file, PeopleNet())
     assert not trap.exists()
-    file.write_bytes(b"")
-    with pytest.raises(InputError, match="cannot be read"):
-        load_weights(file, PeopleNet())
-    with pytest.raises(InputError, match="no file"):
-        load_weights(tmp_path / "none.safetensors", PeopleNet())
-    save_weights(file, KeypointNet())
-    with pytest.raises(InputError, match="weights of KeypointNet"):
-        load_weights(file, PeopleNet())
-    file.write_bytes(save(PeopleNet().state_dict()))  # of another program
-    with pytest.raises(InputError, match="weights of something else"):
-        load_weights(file, PeopleNet())
 
 
 SHAPE = (1080, 1920, 3)
@@ -301,25 +285,20 @@ class Told:
         return [CropEstimates(places, flat, flat, seen, np.full(len(boxes), self.fit))]
 
 
-def found(*boxes, score=0.8):
-    return People(np.array(boxes).reshape(-1, 4), np.full(len(boxes), score))
-
-
 def test_who_is_hidden_by_half_is_found_once_with_his_own_box_and_pose():
     look = Told(FRONT, HIDDEN, FAR)
-    (people,) = run_together([find_occluded_people(found(FRONT, FAR))], look)
-    assert_allclose(people.boxes, [HIDDEN])
-    assert_allclose(people.score, [np.cbrt(0.3 * 0.9 * 0.8)])
-    assert_allclose(people.keypoints[0, 0], HIDDEN[:2])
-    assert_allclose(people.keypoints[0, 16], HIDDEN[2:])
+    (found,) = run_together([find_occluded_people(people(FRONT, FAR, score=0.8))], look)
+    assert_allclose(found.boxes, [HIDDEN])
+    assert_allclose(found.score, [np.cbrt(0.3 * 0.9 * 0.8)])
+    assert_allclose(found.keypoints[0, [0, 16]].ravel(), HIDDEN)
     # A step of 0.35 widths to either side of both; then about the one who was seen.
     assert_allclose(look.asked[0][:, 0], [86.0, 386.0, 114.0, 414.0])
     assert_allclose(look.asked[1], [HIDDEN] * len(look.asked[1]))
 
 
-@pytest.mark.parametrize("people", [found(FRONT, FAR), found(FRONT, HIDDEN, FAR), found()])
-def test_where_all_are_known_nobody_is_found(people):
-    (others,) = run_together([find_occluded_people(people)], Told(*people.boxes))
+@pytest.mark.parametrize("boxes", [(FRONT, FAR), (FRONT, HIDDEN, FAR), ()])
+def test_where_all_are_known_nobody_is_found(boxes):
+    (others,) = run_together([find_occluded_people(people(*boxes, score=0.8))], Told(*boxes))
     assert (others.boxes.shape, others.score.shape) == ((0, 4), (0,))
     assert others.keypoints.shape == (0, 17, 2)
     assert others.confidence.shape == (0, 17)

@@ -19,17 +19,13 @@ from worldpose.detection.bundled_nets import CELL, KeypointNet, PeopleNet, Seen,
 from worldpose.detection.bundled_pose import BundledPoseEstimator
 from worldpose.detection.crops import CROP
 from worldpose.detection.interfaces import People
-from worldpose.detection.landmark_net import POINTS, LandmarkEstimator, LandmarkNet
-from worldpose.detection.models import BUNDLED_WEIGHTS, LANDMARK_WEIGHTS, load_landmarks
+from worldpose.detection.landmark_net import POINTS, LandmarkEstimator
+from worldpose.detection.models import BUNDLED_WEIGHTS, load_landmarks
 from worldpose.detection.net_inference import CROPS, PlacedNet, QuantizedNet
 from worldpose.detection.pipeline import PeopleFinder, detect_people
 from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError
 from worldpose.geometry.boxes import box_iou
-from worldpose.ingest.registration import digest_of_files
-from worldpose.simulation.matches import MatchOptions, simulate_match
-from worldpose.simulation.scenarios import SCENARIOS
-from worldpose.training.labels import read_picture
 
 on_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 
@@ -40,14 +36,6 @@ def crops():
     images = rng.integers(0, 256, (3 * CROPS, CROP[1], CROP[0], 3), dtype=np.uint8)
     maps = rng.random((3 * CROPS, 3, 32, 24)).astype(np.float32)
     return images, maps
-
-
-@pytest.fixture(scope="module")
-def still(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("still") / "tiny"
-    options = MatchOptions(duration=0.04, cameras=2, video=False)
-    simulate_match(SCENARIOS["tiny"], 5, folder, options)
-    return read_picture(sorted((folder / "stills").iterdir())[0])
 
 
 @pytest.mark.parametrize("count", [5, CROPS])
@@ -219,19 +207,9 @@ def shot():
         yield shot, labels.label_landmarks(shot)
 
 
-def test_the_net_in_integers_was_made_from_the_shipped_weights():
-    net = QuantizedNet(LANDMARK_WEIGHTS.with_suffix(".onnx"))
-    assert net.weights_sha256 == digest_of_files(LANDMARK_WEIGHTS)
-
-
 def test_the_shipped_net_finds_landmarks_of_unknown_people(shot):
-    integers = True
     rendered, truth = shot
-    device = (
-        load_landmarks(DetectionSettings(landmarks=True))
-        if integers
-        else LandmarkEstimator(load_weights(LANDMARK_WEIGHTS, LandmarkNet()))
-    )
+    device = load_landmarks(DetectionSettings(landmarks=True))
     height = truth.boxes[:, 3] - truth.boxes[:, 1]
     kept = ~truth.ignored & (height > 34.0)
     assert kept.sum() >= 4

@@ -56,10 +56,6 @@ def raw_yolox():
     return found
 
 
-def logit(share):
-    return np.log(share / (1.0 - share))
-
-
 def detr(classes, person, score):
     """Queries of a DETR: logits, and boxes in shares of the image."""
     logits, boxes = np.full((30, classes), -9.0), np.full((30, 4), 0.5)
@@ -68,26 +64,13 @@ def detr(classes, person, score):
     return [logits, boxes]
 
 
-def decoded_yolox():
-    found = grid(CELLS, 1)
-    rows, columns = np.mgrid[:8, :12]
-    found[: 12 * 8, :2] = np.stack([columns, rows], -1).reshape(-1, 2) * 8.0 + 4.0
-    found[5, :4], found[9, :4] = PERSON, CAR
-    return found
-
-
-def yolov6():
-    found = grid(CELLS, 1)
-    found[:, 4] = 1.0
-    return found
-
-
-def softmax():
-    logits, boxes = detr(92, 1, 4.0)
-    logits[:, -1] = 0.0  # no object
-    return [logits, boxes]
-
-
+DECODED, YOLOV6, NO_OBJECT = grid(CELLS, 1), grid(CELLS, 1), detr(92, 1, 4.0)
+ROWS, COLUMNS = np.mgrid[:8, :12]
+DECODED[: 12 * 8, :2] = np.stack([COLUMNS, ROWS], -1).reshape(-1, 2) * 8.0 + 4.0
+DECODED[5, :4], DECODED[9, :4] = PERSON, CAR
+YOLOV6[:, 4] = 1.0
+NO_OBJECT[0][:, -1] = 0.0
+LOGIT = np.log(0.7 / 0.3)
 MOVENET = np.zeros((6, 56))
 MOVENET[0, 51:] = [20 / 64, 10 / 96, 60 / 64, 30 / 96, 0.7]
 DETS = np.array([[10, 20, 30, 60, 0.7], [60, 20, 80, 40, 0.9]])
@@ -95,14 +78,14 @@ NMS = np.insert(DETS, 5, [0, 2], axis=1)
 LABELS, SCORES = np.array([0, 2]), np.array([0.7, 0.9])
 OUTPUTS = {
     "yolox": ([raw_yolox()], 0.72),
-    "yolox-decoded": ([decoded_yolox()], 0.72),
+    "yolox-decoded": ([DECODED], 0.72),
     "yolov5": ([grid(3 * CELLS, 1)], 0.72),
-    "yolov6": ([yolov6()], 0.8),
+    "yolov6": ([YOLOV6], 0.8),
     "yolov8": ([grid(CELLS, 0).T], 0.8),
     "yolo-nms": ([NMS], 0.7),
-    "detr": (softmax(), np.exp(4.0) / (np.exp(4.0) + 1.0 + 90 * np.exp(-9.0))),
-    "rfdetr": (detr(91, 1, logit(0.7)), 0.7),
-    "rtdetr": (detr(80, 0, logit(0.7)), 0.7),
+    "detr": (NO_OBJECT, np.exp(4.0) / (np.exp(4.0) + 1.0 + 90 * np.exp(-9.0))),
+    "rfdetr": (detr(91, 1, LOGIT), 0.7),
+    "rtdetr": (detr(80, 0, LOGIT), 0.7),
     "rtdetr-boxes": ([LABELS, DETS[:, :4], SCORES], 0.7),
     "movenet": ([MOVENET], 0.7),
 }
@@ -155,14 +138,8 @@ def test_classes_of_people_are_named_numbered_or_asked_for():
     assert _class_names({"names": "{0: 'ball', 1: 'player'}"}) == {0: "ball", 1: "player"}
     assert _class_names({"names": "['ball']"}) == _class_names({"names": "{'ball': 0}"})
     assert _class_names({"names": "['ball']"}) == {0: "ball"}
-    assert (
-        _class_names({"names": "{'a': 'b'}"})
-        == _class_names({"names": "f()"})
-        == _class_names({"names": "'person'"})
-        == _class_names({"names": "{'person'}"})
-        == _class_names({})
-        == {}
-    )
+    for text in ("{'a': 'b'}", "f()", "'person'", "{'person'}"):
+        assert _class_names({"names": text}) == _class_names({}) == {}
 
 
 def test_nets_take_channels_and_grey_levels_as_in_their_training():
@@ -199,12 +176,7 @@ def test_a_crop_shows_the_box_and_its_points_come_back():
         box = np.array([[x - size * 0.2, y - size / 2, x + size * 0.2, y + size / 2]])
         mapping = frame_from_crop(crops_around(box, (48, 64))[0], (48, 64))
         crop = cut_crop(picture, mapping, (48, 64), 0)[..., 0].astype(float)
-        middle = np.array(
-            [
-                np.average(np.arange(48), weights=crop.sum(0)),
-                np.average(np.arange(64), weights=crop.sum(1)),
-            ]
-        )
+        middle = [np.average(np.arange(n), weights=crop.sum(k)) for k, n in enumerate((48, 64))]
         back = mapping[:, :2] @ middle + mapping[:, 2]
         if crop[0].any() or crop[-1].any() or crop[:, 0].any() or crop[:, -1].any():
             continue  # the square reaches over the crop: its middle is another

@@ -39,15 +39,17 @@ def rt_detr_v2(transformers, names=("ball", "person")):
     return transformers.RTDetrV2ForObjectDetection(config)
 
 
+def save_detector(transformers, folder, *names, **size):
+    rt_detr_v2(transformers, *names).eval().save_pretrained(folder)
+    transformers.RTDetrImageProcessorPil(**size).save_pretrained(folder)
+
+
 def test_a_saved_detector_finds_boxes_in_the_picture(tmp_path):
     transformers = pytest.importorskip("transformers")
     import torch
 
     torch.manual_seed(0)
-    rt_detr_v2(transformers).eval().save_pretrained(tmp_path)
-    transformers.RTDetrImageProcessorPil(
-        size={"height": 96, "width": 128}, do_resize=True
-    ).save_pretrained(tmp_path)
+    save_detector(transformers, tmp_path, size={"height": 96, "width": 128}, do_resize=True)
     settings = DetectionSettings(detector=f"transformers:{tmp_path}")
     (detector,) = load_detectors(settings)
     assert detector.view_size == (128, 96)
@@ -104,9 +106,7 @@ def test_a_saved_vitpose_gives_points_around_each_box(tmp_path):
 def test_pickled_weights_and_foreign_folders_are_refused(tmp_path):
     transformers = pytest.importorskip("transformers")
     folder = tmp_path / "pickled"
-    net = rt_detr_v2(transformers)
-    net.save_pretrained(folder)
-    transformers.RTDetrImageProcessorPil().save_pretrained(folder)
+    save_detector(transformers, folder)
     (folder / "model.safetensors").rename(folder / "pytorch_model.bin")
     with pytest.raises(InputError, match=r"model\.safetensors"):
         load_detectors(DetectionSettings(detector=f"transformers:{folder}"))
@@ -126,8 +126,7 @@ def test_classes_of_people_follow_the_rule_of_onnx_detectors(tmp_path):
         (unnamed[:4], None, None),
     ):
         folder = tmp_path / f"{len(names)}{asked}{expected}"
-        rt_detr_v2(transformers, names).save_pretrained(folder)
-        transformers.RTDetrImageProcessorPil().save_pretrained(folder)
+        save_detector(transformers, folder, names)
         settings = DetectionSettings(detector=f"transformers:{folder}", person_classes=asked)
         if expected is None:
             with pytest.raises(InputError, match="4 classes without names"):
@@ -140,8 +139,7 @@ def test_weights_that_are_cut_or_lack_the_head_are_refused(tmp_path):
     transformers = pytest.importorskip("transformers")
     from safetensors.torch import load, save_file
 
-    rt_detr_v2(transformers).save_pretrained(tmp_path)
-    transformers.RTDetrImageProcessorPil().save_pretrained(tmp_path)
+    save_detector(transformers, tmp_path)
     file, settings = tmp_path / "model.safetensors", f"transformers:{tmp_path}"
     content, weights = file.read_bytes(), load(file.read_bytes())
     file.write_bytes(content[: len(content) // 2])

@@ -1,6 +1,6 @@
 """A scene whose detector puts some keypoints far off, with bodies that are nearly right."""
 
-from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -14,29 +14,13 @@ SPREAD = 0.015
 """Standard deviation of the bodies' joints [m], for people that several cameras see."""
 
 
-@dataclass(frozen=True, eq=False)
-class Planted:
-    """Everything of it.
-
-    Attributes:
-        cameras: batch (cameras,).
-        joints: (frames, persons, 17, 3) [m], world, the true ones.
-        views: the bodies.
-        suspects: the detections, taken for the people that they are.
-        displaced: (frames, cameras, detections, 17) keypoints put far off.
-        person: (frames, cameras, detections) person of each; -1 = none.
-    """
-
-    cameras: Camera
-    joints: np.ndarray
-    views: object
-    suspects: TriangulatedDetections
-    displaced: np.ndarray
-    person: np.ndarray
-
-
 def plant(seed, scenario="tiny", duration=0.8, displaced=0.06):
-    """Return a scene of which that share of keypoints is far off, and nothing else is wrong."""
+    """Return a scene of which that share of keypoints is far off, and nothing else is wrong.
+
+    It has cameras (cameras,), the true joints (frames, persons, 17, 3) [m, world], `views` of the
+    bodies, the detections `suspects` that are taken for the people that they are, and of each
+    detection (frames, cameras, detections) its `person`, -1 = none, and keypoints `displaced`.
+    """
     base = SCENARIOS[scenario]
     wrong = {"displaced": displaced, "swapped": 0.0, "stolen": 0.0, "merged": 0.0}
     noise = base.noise.model_copy(update=wrong)
@@ -49,17 +33,16 @@ def plant(seed, scenario="tiny", duration=0.8, displaced=0.06):
     joints = scene.truth.joints + rng.normal(0.0, SPREAD, scene.truth.joints.shape)
     covariance = np.broadcast_to(SPREAD**2 * np.eye(3), (*joints.shape, 3))
     cameras = Camera.stack(list(scene.cameras.values()))
-    return Planted(
-        cameras,
-        scene.truth.joints,
-        view_bodies(cameras, perceived_joints(joints, np.zeros((17, 3))), covariance),
-        TriangulatedDetections(
-            seen.detections.assign_people(index),
-            np.zeros((*index.shape, 2)),
-            np.zeros((*index.shape, 3), dtype=bool),
-            np.zeros(seen.person.shape, dtype=bool),
-            (1.5, 0.04),
-        ),
-        seen.displaced,
-        seen.person,
+    suspects = TriangulatedDetections(
+        *(seen.detections.assign_people(index), np.zeros((*index.shape, 2))),
+        *(np.zeros((*index.shape, 3), dtype=bool), np.zeros(seen.person.shape, dtype=bool)),
+        (1.5, 0.04),
+    )
+    return SimpleNamespace(
+        cameras=cameras,
+        joints=scene.truth.joints,
+        views=view_bodies(cameras, perceived_joints(joints, np.zeros((17, 3))), covariance),
+        suspects=suspects,
+        displaced=seen.displaced,
+        person=seen.person,
     )

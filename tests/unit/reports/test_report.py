@@ -33,23 +33,11 @@ from worldpose.formats.joints_file import JointTracks
 from worldpose.formats.tables import Positions
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
-from worldpose.reports.bodies import BodyTracks, crowded_part
+from worldpose.reports.bodies import BodyTracks
 from worldpose.reports.clips import plot_stadium
 from worldpose.reports.data_set import plot_methods
-from worldpose.reports.drawing import (
-    figure_data,
-    note_undrawn_distortion,
-    style_ground,
-    write_figure,
-)
-from worldpose.reports.html_page import (
-    CaptionedImage,
-    EmbeddedPage,
-    LinkedFile,
-    Section,
-    Table,
-    whole_page,
-)
+from worldpose.reports.drawing import figure_data, note_undrawn_distortion, write_figure
+from worldpose.reports.html_page import CaptionedImage, EmbeddedPage, LinkedFile, Section
 from worldpose.reports.rerun_recording import write_recording
 from worldpose.reports.run_report import report_page, score_rows
 from worldpose.reports.videos import MARGIN_M, PIXELS_PER_M, minimap_frames, overlay_frames
@@ -410,31 +398,6 @@ def test_pictures_of_nobody_are_drawn():
         for found in (gone, np.ones((1, 17, 3))):
             sample = Sample("a", 0, seen_by, gone, {"m": found})
             assert plot_methods(sample).startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize(("focal", "share"), [(900.0, 0.3), (3600.0, None)])
-def test_the_crowded_part_shows_bodies_whole(focal, share):
-    seen_by = look_at_camera([0.0, -10.0, 1.0], [0.0, 0.0, 1.0], focal)
-    body = np.array([[0.2, 0.0, 0.1], [-0.2, 0.0, 1.0], [0.0, 0.0, 1.9]])
-    corner, side = crowded_part(seen_by, body[None])
-    assert (side <= seen_by.image_size).all()
-    pixels = seen_by.project(body)
-    assert ((pixels >= corner) & (pixels <= corner + side)).all()
-    assert share is None or side == pytest.approx(share * seen_by.image_size)
-
-
-def test_a_long_text_of_a_table_has_room_on_a_phone():
-    table = Table("t", ("camera", "change"), (("cam1", 50 * "x"),))
-    page = whole_page("a", "b", [Section("s", (table,))])
-    assert f'<td>cam1</td><td class="long">{50 * "x"}</td>' in page
-    assert "td.long { min-width: 15rem; }" in page
-
-
-def test_a_hall_has_no_touch_line():
-    for pitch, said in ((None, "x [m]"), (PitchSpec(), "x, along the touch line [m]")):
-        axes = Figure().subplots()
-        style_ground(axes, pitch)
-        assert axes.get_xlabel() == said
 
 
 def test_a_clip_has_the_true_paths_of_its_own_frames(monkeypatch):

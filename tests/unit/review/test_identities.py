@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from camera_builders import look_at_camera
 from hypothesis import example, given, settings
-from hypothesis import given as given_that
 from hypothesis import strategies as st
 
 from data_contracts.review import MergedTracks, NamedTrack, Sighting, SplitTrack
@@ -120,7 +119,7 @@ def test_a_sighting_is_the_detection_that_fits_best():
     assert find_sighting(identities(), 0, first=FIRST + 3) is None
 
 
-@given_that(
+@given(
     st.lists(
         st.one_of(
             st.builds(merge, st.integers(0, 5), st.integers(0, 5)),
@@ -142,25 +141,14 @@ def test_every_detection_stays_somebodys_and_replay_gives_the_same(edits):
     assert all(track.frames_seen for track in after.tracks)
 
 
-def mixed_identities():
-    """As `identities`; person 0 stays by the feet for two frames, and 3 is on the plane alone."""
-    index = np.full((6, 2, 2), -1, dtype=np.int16)
-    index[3:5, 1, 0] = 4
-    index[1:, 0, 1] = 5
-    placed = (index >= 0).any(axis=1)
-    return add_plane_tracks(identities(), index, placed, np.array([0, -1]))
-
-
 def test_people_on_the_plane_are_added_and_triangulated_ones_continued():
-    found, before = mixed_identities(), identities()
+    """Person 0 stays by the feet for two frames, and 3 is on the plane alone."""
+    before, index = identities(), np.full((6, 2, 2), -1, dtype=np.int16)
+    index[3:5, 1, 0], index[1:, 0, 1] = 4, 5
+    found = add_plane_tracks(before, index, (index >= 0).any(axis=1), np.array([0, -1]))
     assert found.person.tolist() == [0, 1, 2, 3]
-    assert [track.kind for track in found.tracks] == [
-        "mixed",
-        "triangulated",
-        "triangulated",
-        "plane",
-    ]
-    assert [track.plane_frames for track in found.tracks] == [2, 0, 0, 5]
+    told = [(track.kind, track.plane_frames) for track in found.tracks]
+    assert told == [("mixed", 2), ("triangulated", 0), ("triangulated", 0), ("plane", 5)]
     assert (found.tracks[0].first_frame, found.tracks[0].last_frame) == (0, 4)
     np.testing.assert_array_equal(found.joints[:, :3], before.joints)
 
@@ -168,16 +156,11 @@ def test_people_on_the_plane_are_added_and_triangulated_ones_continued():
 SIZE = np.array([1920, 1080])
 
 
-def camera(center, target):
-    lens = (-0.25, 0.08, 1e-3, -5e-4, 0.0)
-    return look_at_camera(center, target, (1800.0, 1801.8), middle=(955.0, 545.0), lens=lens)
-
-
+PLACES = ((-40.0, -50.0, 12.0), (45.0, -48.0, 15.0), (-30.0, 52.0, 10.0), (60.0, 10.0, 20.0))
+LENS = (-0.25, 0.08, 1e-3, -5e-4, 0.0)
 CAMERAS = [
-    camera((-40.0, -50.0, 12.0), (0.0, 0.0, 1.0)),
-    camera((45.0, -48.0, 15.0), (0.0, 0.0, 1.0)),
-    camera((-30.0, 52.0, 10.0), (0.0, 0.0, 1.0)),
-    camera((60.0, 10.0, 20.0), (0.0, 0.0, 1.0)),
+    look_at_camera(at, (0.0, 0.0, 1.0), (1800.0, 1801.8), middle=(955.0, 545.0), lens=LENS)
+    for at in PLACES
 ]
 
 

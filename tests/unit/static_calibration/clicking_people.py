@@ -98,7 +98,7 @@ def ground_errors(estimate, truth, places):
     """Distance on the surface between places and where the estimate puts their true pixels [m]."""
     pixels = truth.project(places)
     inside = np.isfinite(pixels).all(axis=1)
-    inside[inside] = ((pixels[inside] > 0) & (pixels[inside] < np.array(SIZE) - 1)).all(axis=1)
+    inside[inside] = ((pixels[inside] > 0) & (pixels[inside] < truth.image_size - 1)).all(axis=1)
     rays, places = estimate.unproject(pixels[inside]), places[inside]
     height = places[:, 2]
     for _ in range(4):  # the crown's slope is 1 %: each round is a hundred times closer

@@ -17,19 +17,16 @@ def view(rng, tilt=0.6, noise=0.1, far=0.7, bend=0.0):
     """Corners of a tilted board somewhere in the image."""
     turn = rng.uniform(-tilt, tilt, 3)
     middle = np.append(rng.uniform(-0.3, 0.3, 2) * [1.2, 0.6], 1.0) * far
-    rotation = cv2.Rodrigues(turn)[0]
     flat = PLACES - PLACES.mean(axis=0)
     points = np.column_stack([flat, bend * (flat[:, 0] / flat[:, 0].max()) ** 2])
-    shown, _ = cv2.projectPoints(
-        points @ rotation.T + middle, np.zeros(3), np.zeros(3), MATRIX, DISTORTION
-    )
+    shown, _ = cv2.projectPoints(points, turn, middle, MATRIX, DISTORTION)
     return BoardView(PLACES, shown.reshape(-1, 2) + rng.normal(0.0, noise, (len(PLACES), 2)))
 
 
 def test_a_lens_is_found_within_its_stated_uncertainty():
     rng = np.random.default_rng(3)
     off = []
-    for _ in range(8):
+    for _ in range(4):
         fit = calibrate_lens("cam", [view(rng) for _ in range(10)], SIZE)
         lens = fit.lens
         off += [(lens.focal_px - 900.0) / lens.focal_std_px]
@@ -44,8 +41,8 @@ def test_a_lens_is_found_within_its_stated_uncertainty():
 @pytest.mark.parametrize("bend", [0.0, 0.003])
 def test_a_bent_board_is_told_and_widens_the_lens(bend):
     rng = np.random.default_rng(5)
-    fits = [calibrate_lens("cam", [view(rng, bend=bend) for _ in range(12)], SIZE) for _ in "abcd"]
-    assert [fit.bend_m for fit in fits] == pytest.approx([bend] * 4, abs=1e-4)
+    fits = [calibrate_lens("cam", [view(rng, bend=bend) for _ in range(12)], SIZE) for _ in "ab"]
+    assert [fit.bend_m for fit in fits] == pytest.approx([bend] * 2, abs=1e-4)
     off = [(fit.lens.focal_px - 900.0) / fit.lens.focal_std_px for fit in fits]
     assert np.abs(off).max() < 2.0
 
@@ -74,21 +71,23 @@ def drawn(board_image, rng):
     return cv2.warpPerspective(board_image, way, SIZE, borderValue=255), way
 
 
+def printed(squares):
+    """A printed board (rows, columns) with a border, squares of 60 px."""
+    return cv2.copyMakeBorder(squares, *[60] * 4, cv2.BORDER_CONSTANT, value=255)
+
+
 @pytest.mark.parametrize("charuco", [False, True])
 def test_corners_are_found_where_they_were_drawn(charuco):
-    side, rng = 60, np.random.default_rng(1)
     if charuco:
         board = Board(8, 5, 0.06, "DICT_4X4_50", 0.045)
-        print_ = board._charuco().generateImage((8 * side, 5 * side), marginSize=0)
-        page = cv2.copyMakeBorder(print_, side, side, side, side, cv2.BORDER_CONSTANT, value=255)
+        page = printed(board._charuco().generateImage((480, 300), marginSize=0))
     else:
         board = Board(7, 4, 0.06)
         squares = (np.indices((5, 8)).sum(axis=0) % 2 * 255).astype(np.uint8)
-        page = np.kron(squares, np.ones((side, side), np.uint8))
-        page = cv2.copyMakeBorder(page, side, side, side, side, cv2.BORDER_CONSTANT, value=255)
-    image, way = drawn(page, rng)
+        page = printed(np.kron(squares, np.ones((60, 60), np.uint8)))
+    image, way = drawn(page, np.random.default_rng(1))
     found = board.find(image)
-    inner = np.stack(np.meshgrid(np.arange(2, 9), np.arange(2, 6)), -1).reshape(-1, 1, 2) * side
+    inner = np.stack(np.meshgrid(np.arange(2, 9), np.arange(2, 6)), -1).reshape(-1, 1, 2) * 60
     true = cv2.perspectiveTransform(inner.astype(np.float64) - 0.5, way)[:, 0]
     apart = np.linalg.norm(true[:, None] - found.pixels[None], axis=-1)
     assert len(found.pixels) == 28
@@ -106,11 +105,9 @@ def test_corners_are_found_where_they_were_drawn(charuco):
     ],
 )
 def test_boards_of_the_pattern_before_opencv_4_6_and_exchanged_sides_are_found(stated, said):
-    side, board = 60, Board(8, 6, 0.06, "DICT_4X4_50", 0.045)
-    old = board._charuco()
+    old = Board(8, 6, 0.06, "DICT_4X4_50", 0.045)._charuco()
     old.setLegacyPattern(True)
-    print_ = old.generateImage((8 * side, 6 * side), marginSize=0)
-    page = cv2.copyMakeBorder(print_, side, side, side, side, cv2.BORDER_CONSTANT, value=255)
+    page = printed(old.generateImage((480, 360), marginSize=0))
     image, _ = drawn(page, np.random.default_rng(1))
     tried = [(stated, ""), *([] if stated.find(image) else stated.others(image))]
     found, told = next((found, note) for board, note in tried if (found := board.find(image)))
@@ -151,9 +148,8 @@ def fisheye_views(rng, reach):
     return views
 
 
-@pytest.mark.parametrize("reach", [pytest.param((0.9, 0.5), marks=pytest.mark.slow), (1.6, 0.9)])
-def test_a_fisheye_is_chosen_and_found_within_its_stated_uncertainty(reach):
-    fit = calibrate_lens("cam", fisheye_views(np.random.default_rng(1), reach), SIZE)
+def test_a_fisheye_is_chosen_and_found_within_its_stated_uncertainty():
+    fit = calibrate_lens("cam", fisheye_views(np.random.default_rng(1), (1.6, 0.9)), SIZE)
     lens = fit.lens
     assert (lens.lens_model, len(lens.distortion), fit.used.all()) == ("fisheye", 4, True)
     assert fit.rms_px == pytest.approx(0.1 * np.sqrt(2.0), rel=0.15)

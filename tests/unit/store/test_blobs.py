@@ -30,36 +30,25 @@ def test_what_is_put_is_read(store):
     assert blobs.read("a/b") is None
 
 
-def test_new_is_put_once(store):
-    assert store.blobs.put_new("a/b", b"first")
-    assert not store.blobs.put_new("a/b", b"second")
-    assert (store.blobs.read("a/b"), store.blobs.staged_entries()) == (b"first", [])
-
-
 def test_of_many_that_put_one_new_file_one_succeeds(store):
+    values = [digit * 1000 for digit in (b"0", b"1", b"2", b"3")]
     for number in range(5):
+        path = f"race/{number}"
         with ThreadPoolExecutor(4) as pool:
-            done = list(
-                pool.map(
-                    lambda value, path=f"race/{number}": store.blobs.put_new(path, value),
-                    [b"0" * 1000, b"1" * 1000, b"2" * 1000, b"3" * 1000],
-                )
-            )
+            done = list(pool.map(lambda value, path=path: store.blobs.put_new(path, value), values))
         assert sum(done) == 1
-        assert store.blobs.read(f"race/{number}") == str(done.index(True)).encode() * 1000
-
-
-def failing(code):
-    def fail(*_, **__):
-        raise OSError(code, os.strerror(code))
-
-    return fail
+        assert store.blobs.read(path) == values[done.index(True)]
+    assert not store.blobs.put_new(path, b"later") and store.blobs.staged_entries() == []
 
 
 @pytest.fixture(params=[errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS])
 def without_links(request, monkeypatch):
     """What exFAT, SMB and FUSE answer to link()."""
-    monkeypatch.setattr(os, "link", failing(request.param))
+
+    def fail(*_, **__):
+        raise OSError(request.param, os.strerror(request.param))
+
+    monkeypatch.setattr(os, "link", fail)
 
 
 @pytest.fixture
@@ -167,11 +156,3 @@ def test_a_file_below_a_folder_of_object_storage_has_a_mark(name):
     assert 0 not in (before, after) and before != after
     many = [f"runs/{number}" for number in range(objects.LISTINGS + 1)]
     assert blobs.marks([name, *many])[0] == after
-
-
-def test_marks_of_one_match_list_no_other_match(monkeypatch):
-    listed = []
-    monkeypatch.setattr(objects.ObjectBlobs, "entries", lambda _, top: listed.append(top) or [])
-    paths = [f"results/final/tracking/clip{number}" for number in range(objects.LISTINGS + 1)]
-    objects.ObjectBlobs("bucket", "").marks(["runs/final", *paths])
-    assert sorted(listed) == ["results/final", "runs/final"]

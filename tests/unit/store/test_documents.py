@@ -104,10 +104,6 @@ def test_other_json_is_corruption(data):
         unseal(RunRecord, data, "the place")
 
 
-def describe(old, new):
-    return [str(each) for each in recipe_differences(old, new)]
-
-
 @pytest.mark.parametrize(
     ("change", "line"),
     [
@@ -127,7 +123,7 @@ def describe(old, new):
 )
 def test_every_change_has_its_own_line_and_its_own_key(change, line):
     changed = sample_recipe(**change)
-    assert describe(sample_recipe(), changed) == [line]
+    assert [str(each) for each in recipe_differences(sample_recipe(), changed)] == [line]
     assert recipe_key(changed) != recipe_key(sample_recipe())
 
 
@@ -159,8 +155,7 @@ def test_equal_arrays_give_equal_files(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"joints": np.zeros((40, 3, 3), np.float32)}, "expected dtype float64, found dtype fl"),
-        ({"joints": np.zeros((40, 3, 3), ">f8")}, "found dtype >f8"),
+        ({"joints": np.zeros((40, 3, 3), ">f8")}, "expected dtype float64, found dtype >f8"),
         ({"joints": np.zeros((40, 3))}, r"expected dimensions \(frame, person, coordinate\)"),
         ({"joints": np.zeros((39, 3, 3))}, "dimension frame: expected size 40, as in array frame"),
         ({"inliers": np.zeros((40, 4), bool)}, "dimension person: expected size 3"),

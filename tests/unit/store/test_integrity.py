@@ -29,7 +29,7 @@ from worldpose.store.paths import ResultId
 from worldpose.store.runs import alone, hold_lock, list_pins, may_be_running, pin_run, unpin_run
 from worldpose.store.store import Store, open_run
 
-NOW = datetime(2026, 1, 1, tzinfo=UTC)
+NOW = timedelta(0)
 
 
 @pytest.fixture
@@ -112,7 +112,7 @@ def test_foreign_files_break_no_reader(full):
     assert full.run("final").run_id == "0001"
     assert [each.run_id for each in full.unfinished_runs("final")] == ["0002"]
     assert list_pins(full.blobs, "final") == ()
-    plan = plan_gc(full, older_than=timedelta(0))
+    plan = plan_gc(full, older_than=NOW)
     assert [each.path for each in plan.garbage if not each.path.startswith("staging")] == []
     assert full.reserve_run("final") == "0003"
 
@@ -130,9 +130,7 @@ def test_repair_leaves_a_record_that_is_gone_or_whole_at_a_second_reading(full, 
 
 def test_repair_sets_damaged_records_aside_and_readers_go_on(full):
     run_once(full)
-    pin_run(
-        full.blobs, Pin(name="v1", match_id="final", run_id="0001", who="A", why="", pinned_at=NOW)
-    )
+    pin_run(full.blobs, pin("v1"))
     damaged = ["matches/final.json", "pins/final/v1.json", "runs/final/0002.open.json"]
     damaged.append("runs/final/0003.json")
     for path in damaged:
@@ -235,9 +233,8 @@ def test_a_lock_excludes_other_processes_and_ends_with_its_process(folder_store)
 def test_a_wait_for_a_lock_ends_with_the_name_of_its_file(tmp_path):
     (tmp_path / "project.json").touch()
     file = tmp_path / "a.lock"
-    with hold_lock(file, wait=True), pytest.raises(InputError, match=r"a\.lock: expected a lock"):  # noqa: SIM117
-        with hold_lock(file, wait=True, most_seconds=0.2):
-            pass
+    with hold_lock(file, wait=True), pytest.raises(InputError, match=r"a\.lock: expected a lock"):
+        hold_lock(file, wait=True, most_seconds=0.2).__enter__()
 
 
 def test_processes_get_different_numbers(store):
@@ -255,9 +252,8 @@ PLAN_NOW = timedelta(0)
 
 
 def pin(name, run_id="0001", why=""):
-    return Pin(
-        match_id="final", name=name, run_id=run_id, who="Ada", why=why, pinned_at=datetime.now(UTC)
-    )
+    about = {"who": "Ada", "why": why, "pinned_at": datetime(2026, 1, 1, tzinfo=UTC)}
+    return Pin(match_id="final", name=name, run_id=run_id, **about)
 
 
 @pytest.fixture
@@ -343,20 +339,16 @@ def test_a_run_that_is_pinned_after_planning_is_not_removed(two_runs):
     assert two_runs.runs("final") == ("0001", "0002")
 
 
-def test_a_name_is_as_good_as_a_number(two_runs):
-    pin_run(two_runs.blobs, pin("paper"))
+def test_a_name_is_as_good_as_a_number_and_one_run_s_for_good(two_runs):
+    kept = pin_run(two_runs.blobs, pin("paper", why="first"))
     assert two_runs.run("final", "paper").run_id == "0001"
     assert open_run(two_runs.url, "final", "paper").record.run_id == "0001"
     with pytest.raises(InputError, match="no such run"):
         two_runs.run("final", "other")
-
-
-def test_a_name_is_one_run_s_for_good(two_runs):
-    kept = pin_run(two_runs.blobs, pin("paper", why="first"))
     assert pin_run(two_runs.blobs, pin("paper", why="again")) == kept
     with pytest.raises(InputError, match="run 0001 pinned under"):
         pin_run(two_runs.blobs, pin("paper", run_id="0002"))
-    pin_run(two_runs.blobs, pin("best", run_id="0001"))
+    pin_run(two_runs.blobs, pin("best"))
     assert [each.name for each in list_pins(two_runs.blobs, "final")] == ["best", "paper"]
     with pytest.raises(InputError, match="best, paper"):
         unpin_run(two_runs.blobs, "final", "other")

@@ -69,10 +69,33 @@ def test_result_comes_back_with_labels_units_and_conventions(store):
     assert manifest == store.manifest(*place())
 
 
-def test_unknown_result_is_a_store_error_that_says_what_to_run(store):
+def test_unknown_projects_and_results_are_errors_that_say_what_to_run(url):
+    with pytest.raises(InputError, match=r"no worldpose project at .*worldpose init"):
+        Store.open(url)
+    store = Store.create(url)
     assert not store.has(*place())
     with pytest.raises(StoreError, match="worldpose run final"):
         store.open_result(*place())
+
+
+def test_absent_bucket_is_a_store_error_that_names_it(bucket):
+    with pytest.raises(StoreError, match=r"s3://nowhere/project\.json.*AWS_ENDPOINT_URL"):
+        Store.create("s3://nowhere")
+    for make, address, told in (
+        (Store.create, "s3://", "no bucket"),
+        (Store.open, "gs://e/p", "'gs'"),
+    ):
+        with pytest.raises(InputError, match=told):
+            make(address)
+
+
+def test_manifest_of_another_result_is_corruption(folder_store):
+    publish(folder_store)
+    other = sample_recipe("other")
+    data = folder_store.blobs.read(ResultId(*place()).manifest_path)
+    folder_store.blobs.put(ResultId(*place(other)).manifest_path, data)
+    with pytest.raises(CorruptionError, match="of another result"):
+        folder_store.manifest(*place(other))
 
 
 def publish_together(url, barrier, outcome):
@@ -91,20 +114,6 @@ def test_many_writers_of_one_key_make_one_result(store):
         assert writer.exitcode == 0
     assert contents == {store.manifest(*place()).content}
     assert (verify(store), store.blobs.staged_entries()) == ((), [])
-
-
-def test_manifest_of_another_result_is_corruption(folder_store):
-    publish(folder_store)
-    other = sample_recipe("other")
-    data = folder_store.blobs.read(ResultId(*place()).manifest_path)
-    folder_store.blobs.put(ResultId(*place(other)).manifest_path, data)
-    with pytest.raises(CorruptionError, match="of another result"):
-        folder_store.manifest(*place(other))
-
-
-def test_opening_no_project_says_how_to_make_one(url):
-    with pytest.raises(InputError, match=r"no worldpose project at .*worldpose init"):
-        Store.open(url)
 
 
 @pytest.mark.parametrize(
@@ -136,15 +145,6 @@ def test_failing_disk_is_a_store_error_and_a_retry_succeeds(tmp_path, monkeypatc
     assert verify(store) == ()
 
 
-def test_absent_bucket_is_a_store_error_that_names_it(bucket):
-    with pytest.raises(StoreError, match=r"s3://nowhere/project\.json.*AWS_ENDPOINT_URL"):
-        Store.create("s3://nowhere")
-    with pytest.raises(InputError, match="no bucket"):
-        Store.create("s3://")
-    with pytest.raises(InputError, match="scheme 'gs'"):
-        Store.open("gs://elsewhere/project")
-
-
 def test_run_gives_its_results_by_unit(store):
     run_once(store, sample_recipe("late"), sample_recipe())
     run = worldpose.open_run(store.url, "final")
@@ -157,26 +157,18 @@ def test_run_gives_its_results_by_unit(store):
     assert "tracking/late" in repr(run)
 
 
-def write_sample(writer):
-    writer.write(LAYOUT, sample_arrays(), sample_coordinates(), ATTRIBUTES)
-
-
-def write_twice(writer):
-    write_sample(writer)
-    write_sample(writer)
-
-
-def write_no_number(writer):
-    write_sample(writer)
-    writer.figures["error_px"] = float("nan")
+def write_sample(writer, times=1, **figures):
+    for _ in range(times):
+        writer.write(LAYOUT, sample_arrays(), sample_coordinates(), ATTRIBUTES)
+    writer.figures.update(figures)
 
 
 @pytest.mark.parametrize(
     ("change", "write", "error", "told"),
     [
         ({}, lambda _: None, StoreError, "the stage wrote no arrays"),
-        ({}, write_twice, StoreError, "written only once"),
-        ({}, write_no_number, InternalError, "metric error_px"),
+        ({}, lambda w: write_sample(w, 2), StoreError, "written only once"),
+        ({}, lambda w: write_sample(w, error_px=np.nan), InternalError, "metric error_px"),
         ({"recipe": sample_recipe("other")}, write_sample, InputError, "of its recipe"),
     ],
 )
@@ -236,20 +228,16 @@ BAD = ["", "/", "/etc/passwd", "..", "a/../b", "a/..", "./a", "a//b", "a/", "a\0
 
 
 def test_path_that_could_leave_the_project_is_refused_by_every_method(store, tmp_path):
-    before = sorted(tmp_path.rglob("*"))
-    blobs = store.blobs
+    before, blobs = sorted(tmp_path.rglob("*")), store.blobs
+    one = (blobs.read, blobs.exists, blobs.delete, blobs.entries)
     for path in BAD:
-        for call in (
-            lambda path=path: blobs.read(path),
-            lambda path=path: blobs.exists(path),
-            lambda path=path: blobs.put(path, b"x"),
-            lambda path=path: blobs.put_new(path, b"x"),
-            lambda path=path: blobs.delete(path),
-            lambda path=path: blobs.delete_tree(path, "manifest.json"),
-            lambda path=path: blobs.entries(path),
+        for call, *more in (
+            *((method,) for method in one),
+            *((method, b"x") for method in (blobs.put, blobs.put_new)),
+            (blobs.delete_tree, "manifest.json"),
         ):
             with pytest.raises(InputError, match="path inside a project"):
-                call()
+                call(path, *more)
     assert sorted(tmp_path.rglob("*")) == before
 
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from torch import nn
-from yolo_labels import read_yolo_labels
 
 from worldpose.detection.bundled_nets import KeypointNet, PeopleNet, load_weights, save_weights
 from worldpose.detection.interfaces import People
@@ -283,29 +282,6 @@ def test_categories_say_who_is_a_person_and_in_which_order_joints_are(tmp_path, 
     np.testing.assert_array_equal(read.keypoints[:-1], picture.keypoints)
     assert read.boxes[-1].tolist() == [1.0, 1.0, 9.0, 9.0] and not read.visible[-1].any()
     assert "left out annotations that are no people: 1 of ball" in caplog.text
-
-
-def test_yolo_labels_of_boxes_and_polygons(tmp_path):
-    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((100, 200, 3), dtype=np.uint8))
-    (tmp_path / "a.txt").write_text(
-        "0 0.5 0.5 0.1 0.4\n\n0 0.1 0.2 0.15 0.2 0.125 0.6\n1 0.5 0.5 0.01 0.01\n"
-    )
-    labels = read_yolo_labels(tmp_path / "a.png")
-    # Pixel corners 90 to 110 and 30 to 70; a pixel's centre is half a pixel from its corner.
-    expected = [[89.5, 29.5, 109.5, 69.5], [19.5, 19.5, 29.5, 59.5]]
-    np.testing.assert_allclose(labels.boxes, expected, atol=1e-9)
-    assert labels.keypoints.shape == (2, 17, 2) and not labels.ignored.any()
-    assert len(read_yolo_labels(tmp_path / "a.png", person=1).boxes) == 1
-    (tmp_path / "a.txt").write_text("")
-    assert read_yolo_labels(tmp_path / "a.png").boxes.shape == (0, 4)
-
-
-@pytest.mark.parametrize("line", ["0 0.5 0.5", "0 0.5 0.5 0.1 high", "person 0.5 0.5 0.1 0.1"])
-def test_damaged_yolo_labels_name_file_and_line(tmp_path, line):
-    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((100, 200, 3), dtype=np.uint8))
-    (tmp_path / "a.txt").write_text(f"0 0.5 0.5 0.1 0.1\n{line}\n")
-    with pytest.raises(InputError, match=r"a\.txt.*line 2"):
-        read_yolo_labels(tmp_path / "a.png")
 
 
 def truth(boxes, ignored=None):

@@ -80,17 +80,17 @@ def test_health_over_time_shows_a_knock_and_lost_frames_and_no_healthy_camera(ca
     # The whole of it: the camera's own share in the people is taken out.
     assert np.nanmedian(knocked["shift_px"][half + 3 :, BAD]) == pytest.approx(98.5, abs=3.0)
     assert np.nanmedian(knocked["shift_px"][: half - 3, BAD]) < 2.0
-    lost, _ = measure(cameras, view(cameras, late))
+    lost, _ = measure(cameras, view(cameras, lose))
     assert np.nanmedian(lost["clock_frames"][half + 3 :, BAD]) > 3.0
 
 
 def test_a_camera_departs_no_farther_than_its_calibration_states(cameras):
     people = view(cameras, lambda pixels, *_: pixels + [40.0, 0.0])
-    stated = np.zeros(people.detection_index.shape)
-    _, bad = measure(cameras, people, lambda joints: stated[: len(joints)])
-    assert bad[BAD] == 1.0
-    stated[:, BAD] = 40.0**2
-    _, bad = measure(cameras, people, lambda joints: stated[: len(joints)])
+    for variance, expected in ((0.0, 1.0), (40.0**2, 0.0)):
+        stated = np.zeros(people.detection_index.shape)
+        stated[:, BAD] = variance
+        _, bad = measure(cameras, people, lambda joints, stated=stated: stated[: len(joints)])
+        assert bad[BAD] == expected
     assert (bad == 0.0).all()
 
 
@@ -121,9 +121,9 @@ def test_health_tells_images_that_are_missing_dark_or_blurred(cameras):
     assert np.isnan(found["unmatched"]).all()
 
 
-def late(pixels, *_):
-    """The recorder lost 5 frames after frame 119."""
-    return np.concatenate([pixels[:120], pixels[125:]])
+def lose(pixels, *_, after=119, count=5):
+    """The recorder lost frames."""
+    return np.concatenate([pixels[: after + 1], pixels[after + 1 + count :]])
 
 
 def fast(pixels, *_, rate=1.02):
@@ -165,7 +165,7 @@ def sink(pixels, frame, camera):
         (knock(90.0, 40.0), 120, (90.0, 40.0, 0.0, 0.0)),
         (sink, None, (0.0, 20.0, 0.0, 0.0)),
         (lambda x, f, _: x + (f[..., None] >= 90) * 0.05 * (x - CENTER), 90, (0.0, 0.0, 0.05, 0.0)),
-        (late, 120, 5.0),
+        (lose, 120, 5.0),
         (fast, None, 0.0196 * (FRAMES - 1)),
     ],
     ids=["knocked", "knocked far", "sinking", "zoomed", "lost frames", "fast clock"],
@@ -196,17 +196,12 @@ def test_all_frames_tell_when_a_view_steps_between_sampled_ones(cameras):
     np.testing.assert_allclose(found.amount[:2], [30.0, 9.0], atol=0.6)
 
 
-def skip(pixels, *_):
-    """The recorder lost 9 frames after frame 99."""
-    return np.concatenate([pixels[:100], pixels[109:]])
-
-
 @pytest.mark.parametrize(
     ("spoil", "row", "amount"),
     [
         (lambda pixels, *_: pixels, None, None),
         (knock(90.0, 40.0), 120, (90.0, 40.0, 0.0, 0.0, 0.0)),
-        (skip, 100, (0.0, 0.0, 0.0, 0.0, 9.0)),
+        (partial(lose, after=99, count=9), 100, (0.0, 0.0, 0.0, 0.0, 9.0)),
     ],
     ids=["healthy", "knocked", "lost frames"],
 )
@@ -277,7 +272,7 @@ def test_a_camera_that_sways_is_not_explained(cameras):
 
 
 def test_clocks_that_step_are_traced_from_a_wrong_constant(cameras):
-    people = view(cameras, late)
+    people = view(cameras, lose)
     untracked = replace(people, detection_index=np.empty((0, 0, 0), np.int16))
     courses = trace_clocks(cameras, untracked, FPS, np.array([0.0, 0.0, 2.4, 0.0]))
     assert [len(course) for course in courses] == [1, 1, 3, 1]
@@ -312,16 +307,12 @@ def test_a_drift_with_a_step_and_a_step_of_another_camera_are_traced_together(ca
 def test_a_drift_too_slow_to_be_traced_is_told_by_both_ends(cameras):
     people = view(cameras, partial(fast, rate=1.01))
     untracked = replace(people, detection_index=np.empty((0, 0, 0), np.int16))
-    middle = 0.005 * (FRAMES - 1)
-    given = [[(0, 0.0)], [(0, 0.0)], [(0, middle)], [(0, 0.0)]]
+    # The offsets of the ends count, also where the given one is that of another part.
+    given = [[(0, 0.0)]] * 4
     courses = add_slow_drifts(given, cameras, untracked, FPS, max_offset_s=0.4)
     assert [len(course) for course in courses] == [1, 1, 2, 1]
     rows, values = np.array(courses[BAD]).T
     assert rows.tolist() == [0, FRAMES - 1]
-    np.testing.assert_allclose(values, [0.0, 0.01 * FRAMES], atol=0.3)
-    # The offsets of the ends count, also where the given one is that of another part.
-    given[BAD] = [(0, 0.0)]
-    _, values = np.array(add_slow_drifts(given, cameras, untracked, FPS, max_offset_s=0.4)[BAD]).T
     np.testing.assert_allclose(values, [0.0, 0.01 * FRAMES], atol=0.3)
     # Both ends of a clip of one frame are the same.
     assert add_slow_drifts(given, cameras, untracked[:1], FPS, max_offset_s=0.4) == given
@@ -426,13 +417,11 @@ def test_a_bin_of_two_chunks_is_one_bin(cameras):
     size = 5 * len(cameras.focal)
 
     def chunk(*rows):
-        many = (len(rows), 1)
-        matrix, score = np.tile(np.eye(size), (*many, 1)), np.ones((len(rows), size))
+        matrix, score = np.tile(np.eye(size), (len(rows), 1, 1)), np.ones((len(rows), size))
         return ChangeSums(matrix, score, np.array(rows), FPS, np.ones(len(cameras.focal)))
 
     joined = ChangeSums.join([chunk(2.0, 7.0), chunk(7.0, 12.0)], cameras, FPS)
     assert joined.rows.tolist() == [2.0, 7.0, 12.0]
-    assert joined.matrix[:, 0, 0].tolist() == [1.0, 2.0, 1.0]
-    assert joined.score[:, 3].tolist() == [1.0, 2.0, 1.0]
+    assert joined.matrix[:, 0, 0].tolist() == joined.score[:, 3].tolist() == [1.0, 2.0, 1.0]
     # A clip without people has no bins.
     assert ChangeSums.join([], cameras, FPS).matrix.shape == (0, size, size)

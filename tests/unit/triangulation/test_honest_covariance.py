@@ -32,24 +32,16 @@ INSIDE = 7.815
 
 
 def simulated(seed, people=8):
-    """Cameras, arrays and the truth of a short stretch of the match."""
+    """Cameras, arrays as the tracker would match them, and the truth of a short stretch."""
     scenario = SCENARIOS["match"]
     crowd = scenario.crowd.model_copy(update={"people": people})
     # The common bias of all views would hide whether the noise is honest.
     noise = scenario.noise.model_copy(update={"shared_bias_m": 0.0, "own_bias_m": 0.0})
     changes = {"duration": 0.8, "crowd": crowd, "broadcast": (), "noise": noise}
-    return arrays_of(simulate_scene(scenario.model_copy(update=changes), seed), people)
-
-
-def arrays_of(scene, people):
-    """Cameras, arrays as the tracker would match them, and the truth."""
+    scene = simulate_scene(scenario.model_copy(update=changes), seed)
     seen = scene.static_views()
-    cameras = Camera.stack(list(scene.cameras.values()))
-    return (
-        cameras,
-        (seen.detections.keypoints, seen.detections.confidence, seen.index(people)),
-        scene.truth.joints,
-    )
+    arrays = seen.detections.keypoints, seen.detections.confidence, seen.index(people)
+    return Camera.stack(list(scene.cameras.values())), arrays, scene.truth.joints
 
 
 def squared_deviations(result, truth):
@@ -76,9 +68,8 @@ def coverage(seeds):
     settings = TriangulationSettings(common_bias_m=0.0)
     squared = {"exact": [], "calibrated": [], "two views": []}
     for seed in seeds:
-        cameras, (keypoints, confidence, index), truth = simulated(seed)
-        rng = np.random.default_rng(seed)
-        arrays = keypoints, confidence, index
+        cameras, arrays, truth = simulated(seed)
+        rng, (keypoints, confidence, index) = np.random.default_rng(seed), arrays
         exact = triangulate_joints(cameras, as_detections(*arrays), settings)
         squared["exact"].append(squared_deviations(exact, truth))
         count = len(cameras.focal)
@@ -207,7 +198,3 @@ def test_keypoints_are_hidden_by_a_nearer_person_and_classed_by_their_distance_f
     np.testing.assert_array_equal(found[1], alone)
     inside = (np.abs(far[:, 0] - 302.0) < 9.0) & (far[:, 1] > near[:, 1].min())
     np.testing.assert_array_equal(found[0], alone + CONDITIONS // 2 * inside)
-
-
-def test_without_people_there_are_no_conditions():
-    assert conditions(np.empty((4, 3, 0, 17, 2))).shape == (4, 3, 0, 17)
