@@ -124,7 +124,7 @@ def test_workers_and_server_end_with_a_killed_run(tiny, tmp_path):
     marker = f"WORLDPOSE_TEST_MARK={tmp_path.name}"
     environment = {**os.environ, "WORLDPOSE_TEST_MARK": tmp_path.name}
     environment.pop("PREFECT_API_URL")  # so that it brings a server of its own
-    process = run_until(b"tracking", tiny, tmp_path, environment)  # server and workers are up
+    process = run_until(b"ingest:", tiny, tmp_path, environment)  # server and workers are up
     assert len(processes_with(marker)) > 2
     process.kill()
     process.wait()

@@ -5,14 +5,15 @@ import os
 import socketserver
 from datetime import UTC, datetime, timedelta
 from email import message_from_bytes
+from functools import partial
 from threading import Event, Thread
 from types import SimpleNamespace
 
 import apprise
 import pytest
+import service
 from command_line import worldpose
 from run_records import run_record
-from service import wait_until
 
 from data_contracts.operations import Arrival, MatchSummary, Question, QueuedRun
 from data_contracts.usability import Usability
@@ -31,6 +32,8 @@ from flows.service.plan import ServePlan
 from flows.service.watching import Trouble
 from worldpose.errors import UsageError
 from worldpose.store.store import Store
+
+wait_until = partial(service.wait_until, pause=0.05)
 
 NOW = datetime.now(UTC)
 ABSENT = Channel("absent", "http://127.0.0.1:9/secret")

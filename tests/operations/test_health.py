@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import shutil
 import socket
 import ssl
 from contextlib import ExitStack
@@ -185,12 +184,6 @@ def test_a_foreign_address_is_refused_as_one():
         require_free_ports({"--port": ("192.0.2.1", 8571)})
 
 
-def test_pages_at_a_taken_port_print_no_address(tiny_run, taken):
-    answer = worldpose("review", "serve", "--project", tiny_run, "--port", taken)
-    assert (answer.code, answer.out) == (1, "")
-    assert f"--port {taken}: expected a free port" in answer.err
-
-
 def test_a_service_with_a_taken_port_starts_nothing(tmp_path, taken):
     ports = ("--port", free_ports(1)[0], "--metrics-port", taken)
     answer = worldpose("serve", "--project", tmp_path / "p", "--inbox", tmp_path / "in", *ports)
@@ -341,14 +334,6 @@ def test_what_is_scraped_again_is_looked_at_anew(project_copy):
     assert after["worldpose_poses_total",] == before["worldpose_poses_total",]
     (match,) = Overview(store).look()
     assert {state for states in match.progress.values() for state in states} == {"done"}
-
-
-def test_a_project_in_object_storage_is_told_of_the_disk_of_its_state(bucket, tmp_path):
-    store = Store.create(f"{bucket}/disk")
-    found = scraped(exposition(ProjectMetrics(Overview(store), StateFolder(tmp_path))).decode())
-    assert found["worldpose_disk_free_bytes",] == pytest.approx(
-        shutil.disk_usage(tmp_path).free, rel=0.05
-    )
 
 
 TOKEN = "a token of twenty-four.."

@@ -10,14 +10,15 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext, suppress
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from types import SimpleNamespace
 from uuid import UUID
 
 import psutil
 import pytest
+import service
 from prefect.client.schemas.objects import FlowRun
 from prefect.states import Pending
-from service import wait_until
 
 from data_contracts.operations import Heartbeat, QueuedRun
 from flows.orchestration import suspension
@@ -36,6 +37,8 @@ from worldpose.store.integrity import repair, verify
 from worldpose.store.paths import queue_path
 from worldpose.store.run_queue import MAX_KILLS, MAX_SERVICE_DEATHS, RunQueue, queue_of
 from worldpose.store.store import Store
+
+wait_until = partial(service.wait_until, pause=0.05)
 
 NOW = datetime.now(UTC)
 

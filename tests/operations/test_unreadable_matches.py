@@ -7,14 +7,15 @@ import shutil
 import time
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from threading import Event, active_count
 from types import SimpleNamespace
 
 import pytest
+import service
 from command_line import worldpose
 from fastapi import HTTPException
 from page_client import HERE, TOKEN, TestClient, browser, log_in, served
-from service import wait_until
 from stalled_disk import stalled
 from starlette.responses import Response
 
@@ -37,6 +38,8 @@ from flows.web.intake import NewDraft
 from worldpose.store.run_queue import queue_of
 from worldpose.store.runs import alone
 from worldpose.store.store import Store
+
+wait_until = partial(service.wait_until, pause=0.05)
 
 
 @pytest.fixture
