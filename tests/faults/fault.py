@@ -1,16 +1,14 @@
 """Kills or blocks a process where a test says so.
 
-A Dask worker loads this file as its preload; `python tests/faults/fault.py ARGS` runs the command
-line with it. WORLDPOSE_TEST_FAULT holds the plan as JSON. With `point`, the process dies at this
-commit point, once over all processes: `skip` visits of each process before, with the whole process
-group if `whole_group`, and `struck` is a file that is made then. With `unit`, the process hangs or
-dies, as `how` says, whenever that unit is begun.
+A Dask worker loads this file as its preload. WORLDPOSE_TEST_FAULT holds the plan as JSON. With
+`point`, the process dies at this commit point, once over all processes: `skip` visits of each
+process before, and `struck` is a file that is made then. With `unit`, the process hangs or dies, as
+`how` says, whenever that unit is begun.
 """
 
 import json
 import os
 import signal
-import sys
 import time
 from pathlib import Path
 
@@ -33,8 +31,6 @@ def install():
             Path(plan["struck"]).touch(exist_ok=False)
         except FileExistsError:
             return
-        if plan.get("whole_group"):
-            os.killpg(0, signal.SIGKILL)
         os.kill(os.getpid(), signal.SIGKILL)
 
     install_fault_hook(strike)
@@ -55,11 +51,3 @@ def spoil_unit(plan):
 
 def dask_setup(worker):
     install()
-
-
-if __name__ == "__main__":
-    from flows.cli import main
-
-    install()
-    sys.argv = ["worldpose", *sys.argv[1:]]
-    main()

@@ -7,7 +7,8 @@ import signal
 from contextlib import contextmanager
 
 import pytest
-from test_killed_runs import assert_nothing_half_written, assert_same_store
+from checker import half_written
+from test_killed_runs import assert_same_store
 
 from data_contracts.review import DeletedDetection
 from flows import iterate
@@ -50,7 +51,6 @@ def no_machines(store, request):
 
 
 def loop(project, folder, at_commit_point):
-    """The loop over iterations in this process."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(match_flow, "compute", compute_here)
         patch.setattr(iterate, "run_match", run_here)
@@ -92,7 +92,6 @@ def short(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def undisturbed(short, tmp_path_factory):
-    """A project without faults, and the commit points that its loop passed."""
     project = tmp_path_factory.mktemp("undisturbed") / "project"
     visits = []
     # Here, so that copies of this process find every kernel loaded.
@@ -107,13 +106,12 @@ def test_killed_at_a_random_commit_point_of_the_loop(seed, short, undisturbed, t
     skip = random.Random(seed).randrange(len(visits))
     project = tmp_path / "project"
     assert loop_and_die(project, short, skip) == -signal.SIGKILL
-    assert_nothing_half_written(project)
+    assert half_written(project) == []
     loop(project, short, None)
     assert_same_store(project, reference)
 
 
 def delete_a_box(project):
-    """Edits of a person on another machine during the run."""
     store = Store.open(str(project))
     (match_id,) = store.matches()
     deleted = DeletedDetection(camera="cam01", frame=3, detection=0)
@@ -121,7 +119,6 @@ def delete_a_box(project):
 
 
 def standing(project):
-    """The latest run's results."""
     store = Store.open(str(project))
     (match_id,) = store.matches()
     return store.run(match_id).results
@@ -146,7 +143,6 @@ def assert_every_run_is_of_one_piece(project):
 
 @pytest.fixture(scope="module")
 def edited(short, tmp_path_factory):
-    """A project in which the same was done after the edit."""
     project = tmp_path_factory.mktemp("edited") / "project"
     register(Store.create(str(project)), short)
     delete_a_box(project)

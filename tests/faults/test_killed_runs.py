@@ -4,12 +4,11 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
-from checker import half_written, problems_of
+from checker import problems_of
 from command_line import TINY, WORLDPOSE, succeed, worldpose
 
 from worldpose.store.blobs import COMMIT_POINTS
@@ -19,11 +18,9 @@ pytestmark = [pytest.mark.usefixtures("server"), pytest.mark.faults]
 
 FAULT = Path(__file__).with_name("fault.py")
 IN_WORKER = [point for point in COMMIT_POINTS if "run_record" not in point]
-IN_MAIN = [point for point in COMMIT_POINTS if "run_record" in point]
 
 
 def planned(**plan):
-    """The environment of a run whose processes load the fault."""
     environment = {"DASK_DISTRIBUTED__WORKER__PRELOAD": str(FAULT)}
     return environment | {"WORLDPOSE_TEST_FAULT": json.dumps(plan)}
 
@@ -76,50 +73,6 @@ def test_a_deadly_unit_is_given_up_and_named_and_the_others_finish(
     assert (again.code, again.json["executed"]) == (0, 1)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("point", IN_MAIN)
-def test_the_whole_process_killed_around_the_run_record(point, tiny, tiny_run, tmp_path):
-    environment, struck = fault_environment(tmp_path, point)
-    project = tmp_path / "worldpose-data"
-    killed = subprocess.run(
-        [sys.executable, FAULT, "run", tiny, "--project", project],
-        env={**os.environ, **environment},
-        capture_output=True,
-    )
-    assert killed.returncode == -signal.SIGKILL
-    assert struck.exists()
-    succeed("run", tiny, "--project", project)
-    assert_same_store(project, tiny_run)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("point", IN_WORKER)
-def test_the_whole_process_group_killed_at_a_commit_point(point, tiny, tiny_run, tmp_path):
-    environment, struck = fault_environment(tmp_path, point, skip=1, whole_group=True)
-    project = tmp_path / "worldpose-data"
-    process = start_run(tiny, project, environment)
-    assert process.wait() == -signal.SIGKILL
-    assert struck.exists()
-    assert_nothing_half_written(project)
-    succeed("run", tiny, "--project", project)
-    assert_same_store(project, tiny_run)
-
-
-def start_run(match, project, environment):
-    """A run of two workers, leading a process group of its own."""
-    return subprocess.Popen(
-        [*WORLDPOSE, "run", str(match), "--project", str(project), "--workers", "2"],
-        start_new_session=True,
-        env={**os.environ, **environment},
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-
-
-def assert_nothing_half_written(project):
-    assert half_written(project) == [], "something half-written can be read"
-
-
 def test_workers_and_server_end_with_a_killed_run(tiny, tmp_path):
     marker = f"WORLDPOSE_TEST_MARK={tmp_path.name}"
     environment = {**os.environ, "WORLDPOSE_TEST_MARK": tmp_path.name}
@@ -148,7 +101,6 @@ def run_until(word, match, folder, environment):
 
 
 def processes_with(marker):
-    """Ids of live processes that have this in their environment."""
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
         try:
@@ -162,7 +114,6 @@ def processes_with(marker):
 
 @pytest.mark.slow
 def test_a_terminated_run_ends_at_once_and_goes_on_with_the_same_command(tiny, tmp_path):
-    """Ctrl-C: tests/flows/test_progress.py."""
     environment = {**os.environ}
     environment.pop("PREFECT_API_URL")
     process = run_until(b"ingest:", tiny, tmp_path, environment)

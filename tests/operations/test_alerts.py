@@ -113,7 +113,6 @@ class Conversation(socketserver.StreamRequestHandler):
 
 @pytest.fixture
 def mail_server():
-    """A mail server, which keeps letters."""
     with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Conversation) as server:
         server.letters, server.receivers = [], []
         Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()

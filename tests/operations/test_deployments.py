@@ -44,7 +44,6 @@ wait_until = partial(service.wait_until, pause=0.05)
 
 @pytest.fixture(scope="module")
 def plan(server, tmp_path_factory):
-    """A plan whose deployments are installed."""
     # One folder, however often a process comes back to these tests: the server serves one project.
     folder = tmp_path_factory.getbasetemp() / "of-deployments"
     Store.create(folder)
@@ -322,7 +321,6 @@ def test_a_release_lies_in_the_project_under_a_name_that_leads_nowhere_else(tmp_
 
 @pytest.fixture
 def lonely(plan, tmp_path):
-    """The plan with a queue of its own, and its runs."""
     own = plan.model_copy(update={"project": str(tmp_path), "state": tmp_path / "operations"})
     Store.create(own.project)
     return own, MatchRuns.of_plan(own)

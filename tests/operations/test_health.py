@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import socket
 import ssl
 from contextlib import ExitStack
@@ -230,7 +231,6 @@ DASHBOARD = INFRA / "grafana" / "worldpose.json"
 
 
 def scraped(text):
-    """Samples by name and labels, as Prometheus itself reads them."""
     return {
         (sample.name, *sorted(sample.labels.items())): sample.value
         for family in text_string_to_metric_families(text)
@@ -240,7 +240,6 @@ def scraped(text):
 
 @pytest.fixture
 def served(project_copy):
-    """A served project, and a function that queries its metrics server."""
     state = StateFolder(project_copy / "operations")
     now = datetime.now(UTC)
     for name, known in (("a", "taken"), ("b", "refused"), ("c", "refused")):
@@ -334,6 +333,12 @@ def test_what_is_scraped_again_is_looked_at_anew(project_copy):
     assert after["worldpose_poses_total",] == before["worldpose_poses_total",]
     (match,) = Overview(store).look()
     assert {state for states in match.progress.values() for state in states} == {"done"}
+
+
+def test_a_project_in_object_storage_is_told_of_the_disk_of_its_state(bucket, tmp_path):
+    figures = ProjectMetrics(Overview(Store.create(f"{bucket}/disk")), StateFolder(tmp_path))
+    free = scraped(exposition(figures).decode())["worldpose_disk_free_bytes",]
+    assert free == pytest.approx(shutil.disk_usage(tmp_path).free, rel=0.05)
 
 
 TOKEN = "a token of twenty-four.."

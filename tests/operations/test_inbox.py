@@ -232,7 +232,6 @@ def test_a_second_copy_is_refused_with_the_name_of_the_first(desk, drop):
 
 
 def take_in_and_die(folder, poisoned):
-    """A process that dies, as from the system's out-of-memory killer, when it reads one match."""
     from flows.service import inbox
 
     register = inbox.register
@@ -324,7 +323,6 @@ def name_pitch_outside(folder):
 
 
 def describe(text):
-    """A function that replaces the description of a match."""
     return lambda folder: (folder / "match.yaml").write_text(text)
 
 

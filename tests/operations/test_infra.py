@@ -234,7 +234,6 @@ def test_kubernetes_manifests_refer_to_what_is_there():
 
 
 def needs(tool):
-    """A mark: set-ups are checked by their own tools if installed."""
     return pytest.mark.skipif(shutil.which(tool) is None, reason=f"{tool} is not installed")
 
 

@@ -73,7 +73,6 @@ def test_the_lists_of_a_season_are_there_within_a_second(served, project_copy):
 
 @pytest.fixture
 def matches(served, tmp_path):
-    """A function that registers so many small matches in the project before it is served."""
 
     def make(count, first=0):
         store = Store.create(str(served.project))

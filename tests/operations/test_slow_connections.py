@@ -71,7 +71,6 @@ def send_first(opened):
 
 
 def still_open(opened):
-    """How many the server has not closed."""
     left = 0
     for each, _ in opened:
         try:
@@ -100,7 +99,6 @@ def attack(port, count, seconds):
 
 
 def send_byte_by_byte(port):
-    """Seconds until the server closes the connection of a body that comes slowly."""
     began = time.monotonic()
     with socket.create_connection(("127.0.0.1", port)) as slow:
         slow.sendall(HALF_BODY)

@@ -89,7 +89,6 @@ def test_pages_show_the_others_beside_a_stale_mount(stale_mount):
 
 @pytest.fixture
 def silent(monkeypatch, two):
-    """A function that lets the disk of the first match answer: before, no stat or read ends."""
     monkeypatch.setattr(patience, "SILENT_SECONDS", 0.5)
     monkeypatch.setattr(patience, "SHORT_SECONDS", 0.2)
     stat, answers, file = os.stat, Event(), two / "first" / "match.yaml"

@@ -108,14 +108,6 @@ def test_a_fault_of_poses_is_named(data_set, model, kind, fault):
     assert all(each.where[0].startswith("poses/A_1.npz") for each in found)
 
 
-def test_a_slip_of_one_frame_is_named(data_set, model):
-    folder = data_set("static")
-    edit_poses(folder, late_poses)
-    _, found = findings(folder, model)
-    assert {each.fault for each in found} == {"frame_offset"}
-    assert "3D is 1 frame late" in found[0].says
-
-
 def test_a_slip_of_the_moving_camera_is_named(data_set, model):
     folder = data_set("challenge")
 

@@ -30,7 +30,6 @@ CLIP = "ann-1_A"
 
 @pytest.fixture(scope="module")
 def origins(model, poses, main_camera, tmp_path_factory):
-    """Runs of three matches of two clips each, and their splits."""
     store = Store.create(str(tmp_path_factory.mktemp("store") / "project"))
     found = []
     for match, split in SPLITS.items():
@@ -69,7 +68,6 @@ LICENCES = dict.fromkeys(ASSETS, "For tests alone.")
 
 @pytest.fixture(scope="module")
 def written(origins, tmp_path_factory):
-    """A sound data set, and its hidden truth; read only."""
     folder = tmp_path_factory.mktemp("released")
     registry = folder / "subjects.yaml"
     registry.write_text("keeper: [ann-1/A/0, ann-1/B/0]\nstriker: [bea-1/A/2, bea-1/B/1]\n")
@@ -222,7 +220,6 @@ def seal(folder, truth):
 
 
 def state(change):
-    """A fault in release.json."""
 
     def plant(folder, truth):
         path = folder / "release.json"
@@ -234,7 +231,6 @@ def state(change):
 
 
 def files(name, change):
-    """A fault in the arrays of a file that the digests include."""
 
     def plant(folder, truth):
         edit(truth / name.removeprefix("hidden/") if "hidden/" in name else folder / name, change)
@@ -261,12 +257,15 @@ def later(arrays):
 
 def leave_truth(folder, truth):
     shutil.copytree(truth / "poses", folder / "test" / "poses")
-    seal(folder, truth)
-
-
-def leave_camera(folder, truth):
     shutil.copy(truth / "cameras" / "cleo-1_A.npz", folder / "test" / "cameras")
+    shutil.copytree(truth / "cameras" / "cleo-1_A", folder / "test" / "cameras" / "cleo-1_A")
     seal(folder, truth)
+
+
+def change_unsealed(folder, truth):
+    (folder / BOXES).unlink()
+    (folder / "val" / "x.txt").touch()
+    edit(folder / JOINTS, lambda a: a.update(joints=a["joints"][[1, 0, *range(2, HALF)]]))
 
 
 def put_keeper_into_val(stated):
@@ -279,12 +278,11 @@ def count_one_more(stated):
 
 
 def clip(name, **changes):
-    """A fault in what release.json says of a clip."""
     return state(lambda stated: stated["clips"][name].update(changes))
 
 
-def footage(**changes):
-    return state(lambda stated: stated["clips"][CLIP]["footage"][CLIP].update(changes))
+def footage(name, **changes):
+    return state(lambda stated: stated["clips"][name]["footage"][name].update(changes))
 
 
 def unreadable_camera(folder, truth):
@@ -297,13 +295,11 @@ POSES, CAMERA, BOXES = (f"train/{kind}/{CLIP}.npz" for kind in ("poses", "camera
 JOINTS = f"train/{CLIP}.joints.npz"
 NORTH = "train/cameras/ann-1_B/north.npz"
 FAULTS = {
-    "missing file": (lambda f, t: (f / BOXES).unlink(), "missing_files", BOXES),
-    "changed digest": (
-        lambda f, t: edit(f / BOXES, put("visibility", (0, 0), 0.0)),
-        "changed_files",
-        BOXES,
+    "unsealed changes": (
+        change_unsealed,
+        ("missing_files", "unlisted_files", "changed_files"),
+        (BOXES, "val/x.txt", JOINTS),
     ),
-    "unlisted file": (lambda f, t: (f / "val" / "x.txt").touch(), "unlisted_files", "val/x.txt"),
     "swapped frames": (files(POSES, swap("transl")), "boxes_differ", BOXES),
     "swapped frames of joints": (
         files(JOINTS, lambda a: a.update(joints=a["joints"][[1, 0, *range(2, HALF)]])),
@@ -313,13 +309,22 @@ FAULTS = {
     "transposed rotation": (files(CAMERA, transpose_rotation), "transposed_rotation", CAMERA[:-4]),
     "late camera": (files(CAMERA, later), "boxes_differ", BOXES),
     "NaN pose": (files(POSES, put("transl", (0, 3), np.nan)), "missing_values_disagree", POSES),
-    "truth of the test part": (leave_truth, "test_truth", "test/poses/cleo-1_A.npz"),
-    "camera of the test part": (leave_camera, "test_truth", "test/cameras/cleo-1_A.npz"),
+    "truth of the test part": (
+        leave_truth,
+        ("test_truth",) * 3,
+        (
+            *("test/poses/cleo-1_A.npz", "test/cameras/cleo-1_A.npz"),
+            "test/cameras/cleo-1_A/north.npz",
+        ),
+    ),
     "box outside": (files(BOXES, put("boxes", (2, 0, 2), 2500.0)), "box_outside", BOXES),
     "broken camera": (files(CAMERA, put("K", (4, 0, 0), -1.0)), "unreadable", f"train: {CLIP}"),
     "no visibility": (files(BOXES, lambda a: a.pop("visibility")), "unreadable", f"train: {CLIP}"),
-    "a broken camera hides no fault": (unreadable_camera, "box_outside", BOXES),
-    "broken test camera": (unreadable_camera, "unreadable", "test/cameras/cleo-1_A.npz"),
+    "a broken test camera hides no fault": (
+        unreadable_camera,
+        ("box_outside", "unreadable"),
+        (BOXES, "test/cameras/cleo-1_A.npz"),
+    ),
     "test box outside": (
         files("test/boxes/cleo-1_A.npz", put("boxes", (2, 0, 2), 2500.0)),
         "box_outside",
@@ -341,22 +346,10 @@ FAULTS = {
         "transposed_rotation",
         "train/cameras/ann-1_A/north",
     ),
-    "static camera of other images": (
-        clip(CLIP, rig={"north": {"image_size": [960, 540], "visible": 1.0}}),
-        "camera_differs",
-        "train/cameras/ann-1_A/north.npz",
-    ),
-    "rig of the test part": (clip("cleo-1_A", rig={}), "test_truth", "cleo-1_A"),
     "static camera of the hidden part unstated": (
         lambda f, t: [(t / "rigs.json").write_text("{}"), seal(f, t)],
         "views_differ",
         "cleo-1_A",
-    ),
-    "static camera unstated": (clip(CLIP, rig={}), "views_differ", CLIP),
-    "static camera of the test part": (
-        lambda f, t: shutil.copytree(t / "cameras" / "cleo-1_A", f / "test/cameras/cleo-1_A"),
-        "test_truth",
-        "test/cameras/cleo-1_A/north.npz",
     ),
     "other pooled shape": (
         files("train/subjects.npz", put("betas", (0, 3), 0.7)),
@@ -394,7 +387,18 @@ FAULTS = {
 
 STATED = [
     (state(put_keeper_into_val), "subject_in_two_splits", "keeper"),
-    (footage(sha256="0" * 64), "footage_differs", CLIP),
+    (footage(CLIP, sha256="0" * 64), "footage_differs", CLIP),
+    (footage("ann-1_B", path="train/footage/none.mp4"), "footage_differs", "ann-1_B"),
+    (
+        clip(CLIP, rig={"north": {"image_size": [960, 540], "visible": 1.0}}),
+        "camera_differs",
+        "train/cameras/ann-1_A/north.npz",
+    ),
+    (clip("ann-1_B", rig={}), "views_differ", "ann-1_B"),
+    (clip("cleo-1_A", rig={}), "test_truth", "cleo-1_A"),
+    (clip("bea-1_B", views={}), "views_differ", "bea-1_B"),
+    (clip("ann-1_B", first_frame=3), "statement_differs", "ann-1_B"),
+    (clip("bea-1_B", body_model="smpl-male"), "statement_differs", "bea-1_B"),
     (clip(CLIP, views={CLIP: [3840, 2160]}), "views_differ", CLIP),
     (clip(CLIP, fps=25.0), "statement_differs", CLIP),
     (clip("cleo-1_A", frames=3), "statement_differs", "cleo-1_A"),
@@ -411,12 +415,6 @@ def plant_statements(folder, truth):
         plant(folder, truth)
 
 
-FAULTS |= {
-    "footage nowhere": (footage(path="train/footage/none.mp4"), "footage_differs", CLIP),
-    "no views": (clip(CLIP, views={}), "views_differ", CLIP),
-    "wrong first frame": (clip(CLIP, first_frame=3), "statement_differs", CLIP),
-    "wrong body model": (clip(CLIP, body_model="smpl-male"), "statement_differs", CLIP),
-}
 FAULTS |= {"statements": (plant_statements, *zip(*(each[1:] for each in STATED), strict=True))}
 
 

@@ -23,7 +23,6 @@ from worldpose.body.model import BodyParameters
 from worldpose.dataset.benchmark import require_one_rate, score_folders
 from worldpose.dataset.manifest import (
     ORIGINS,
-    changed_files,
     origins_of,
     read_manifest,
     released_files,
@@ -32,7 +31,7 @@ from worldpose.dataset.manifest import (
     write_manifest,
     write_origins,
 )
-from worldpose.dataset.statistics import camera_kind, clip_statistics, kind_of
+from worldpose.dataset.statistics import camera_kind, kind_of
 from worldpose.errors import InputError, UsageError
 from worldpose.evaluation.metrics import evaluate_joints
 from worldpose.formats.archives import write_archive
@@ -114,14 +113,6 @@ def test_ten_made_clips_are_counted_as_plain_loops_count_them(tmp_path):
     assert picture.shape[:2] == (462, 1540)
 
 
-def test_a_gap_adds_no_way_and_heights_do_not_count():
-    nan = np.nan
-    places = np.array([[0.0, 0.0, 1.0], [3.0, 4.0, 9.0], [nan] * 3, [50.0, 0.0, 1.0], [50.0, 1, 1]])
-    found = clip_statistics(np.stack([places, np.full((5, 3), nan)], axis=1), 50.0)
-    assert found.trajectories_m == (6.0,)
-    assert (found.persons, found.poses, found.frames, found.seconds) == (1, 4, 5, 0.1)
-
-
 @pytest.mark.parametrize("command", ["statistics", "check"])
 def test_a_frame_rate_that_nobody_stated_is_said_and_an_export_s_is_taken(tmp_path, command):
     places = made(np.random.default_rng(3), 50, 2).astype(np.float64)
@@ -174,15 +165,6 @@ def test_a_manifest_comes_back_and_holds_the_conventions(tmp_path):
     assert stored["files"][0]["size"] == 6
     write_manifest(tmp_path / "again", manifest)
     assert (tmp_path / "again" / "manifest.json").read_bytes() == path.read_bytes()
-
-
-def test_a_changed_and_a_lost_file_are_noticed(tmp_path):
-    manifest = manifest_of(tmp_path)
-    assert changed_files(tmp_path, manifest.files) == []
-    (tmp_path / "poses" / "A_1.npz").write_bytes(b"p0ses")
-    assert changed_files(tmp_path, manifest.files) == ["poses/A_1.npz"]
-    (tmp_path / "joints.npz").unlink()
-    assert changed_files(tmp_path, manifest.files) == ["joints.npz", "poses/A_1.npz"]
 
 
 def test_a_folder_without_a_manifest_has_none_and_another_contract_is_refused(tmp_path):

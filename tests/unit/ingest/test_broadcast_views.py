@@ -167,7 +167,6 @@ CLICKED = ClickedMarkings(
 
 @pytest.fixture
 def folder(write_tiny):
-    """A match whose second camera is clicked."""
     annotations = MatchAnnotations(clicked={"cam2": CLICKED})
     return write_tiny(("cam1",), annotations=annotations)
 

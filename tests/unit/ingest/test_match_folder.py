@@ -20,7 +20,6 @@ from worldpose.ingest.writing import write_match, write_offsets
 
 @pytest.fixture
 def edit(match_folder):
-    """Change match.yaml: `edit(lambda content: ...)`."""
 
     def change(function):
         path = match_folder / "match.yaml"
@@ -225,12 +224,6 @@ def test_a_broadcast_camera_covers_its_clip(match_folder, make_people):
     assert calibration is None
 
 
-@pytest.mark.parametrize("unit_id", ["cam9", "main", "corner"])
-def test_a_unit_without_detections_is_refused(match_folder, unit_id):
-    with pytest.raises(InputError, match="those of cam1, cam2, goal"):
-        read_unit(read_match(match_folder), unit_id)
-
-
 @pytest.fixture
 def one():
     return match_spec(["cam1"], {"clip": {"frame_count": 3}})
@@ -298,20 +291,9 @@ def test_a_failure_on_the_way_leaves_nothing(tmp_path, one, make_people):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", ["cam9", "../cam1"])
-def test_data_of_unknown_cameras_are_refused(tmp_path, one, make_people, make_camera, name):
-    people = {"cam1": make_people()}
-    with pytest.raises(InputError, match="data of its cameras and clips: cam1, clip"):
-        write_match(
-            tmp_path / "m", one, calibrations={}, observations={**people, name: people["cam1"]}
-        )
-    with pytest.raises(InputError, match="data of its cameras and clips: cam1, clip"):
-        write_match(tmp_path / "m", one, calibrations={name: make_camera()}, observations=people)
-
-
 def test_clock_offsets_are_written_into_match_yaml_and_all_else_stays(tmp_path):
     file = tmp_path / "match.yaml"
-    file.write_text(
+    text = (
         "match_id: m  # the final\n"
         "fps: 25\n"
         "cameras:\n"
@@ -324,21 +306,11 @@ def test_clock_offsets_are_written_into_match_yaml_and_all_else_stays(tmp_path):
         "clips:\n"
         "  - {id: clip, frame_count: 3}\n"
     )
+    file.write_text(text)
     write_offsets(tmp_path, {"a": -12, "b": 2, "c": 7})
-    assert file.read_text() == (
-        "match_id: m  # the final\n"
-        "fps: 25\n"
-        "cameras:\n"
-        "  - {id: a, width: 64, height: 48, offset_frames: -12}   # late\n"
-        "  - {id: b, offset_frames: 2, width: 64, height: 48}\n"
-        "  - id: c\n"
-        "    offset_frames: 7\n"
-        "    width: 64   # small\n"
-        "    height: 48\n"
-        "  - {id: d, width: 64, height: 48, offset_frames: 1}\n"
-        "clips:\n"
-        "  - {id: clip, frame_count: 3}\n"
-    )
+    expected = text.replace("offset_frames: 3", "offset_frames: -12")
+    expected = expected.replace("id: b,", "id: b, offset_frames: 2,")
+    assert file.read_text() == expected.replace("id: c\n", "id: c\n    offset_frames: 7\n")
     with pytest.raises(InputError, match=r"match.yaml: expected the cameras z, found others"):
         write_offsets(tmp_path, {"z": 1})
     assert "offset_frames: 7" in file.read_text()
@@ -365,11 +337,6 @@ def record_refusal(data, model=MatchSpec):
     with pytest.raises(InputError) as caught:
         validate_record(model, data, "match.yaml")
     return caught.value
-
-
-def test_plain_data_becomes_the_record():
-    spec = validate_record(MatchSpec, match(), "match.yaml")
-    assert (spec.fps, spec.cameras[1].id, spec.clips[0].frame_count) == (25.0, "cam2", 10)
 
 
 FIRST = "match.yaml: cameras[0]"
