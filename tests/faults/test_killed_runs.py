@@ -2,7 +2,6 @@
 
 import json
 import os
-import signal
 import subprocess
 import time
 from pathlib import Path
@@ -110,18 +109,3 @@ def processes_with(marker):
         except OSError:
             continue
     return [pid for pid in found if pid != os.getpid()]
-
-
-@pytest.mark.slow
-def test_a_terminated_run_ends_at_once_and_goes_on_with_the_same_command(tiny, tmp_path):
-    environment = {**os.environ}
-    environment.pop("PREFECT_API_URL")
-    process = run_until(b"ingest:", tiny, tmp_path, environment)
-    os.killpg(process.pid, signal.SIGTERM)
-    started = time.monotonic()
-    _, said = process.communicate(timeout=60)
-    # It goes through Prefect, which took 3 s.
-    assert time.monotonic() - started < 30
-    assert process.returncode not in (0, None)
-    assert b"Traceback" not in said, said
-    succeed("run", tiny, "--project", tmp_path / "worldpose-data", "--until", "tracking")

@@ -174,13 +174,10 @@ def test_a_taken_port_is_named_with_the_next_free_one(chosen):
     require_free_ports(wanted)
 
 
-def test_a_port_for_two_parts_is_refused():
+def test_a_port_for_two_parts_and_a_foreign_address_are_refused():
     (port,) = free_ports(1)
     with pytest.raises(InputError, match=f"--metrics-port {port}: .*another program"):
         require_free_ports({"--port": (HOST, port), "--metrics-port": (HOST, port)})
-
-
-def test_a_foreign_address_is_refused_as_one():
     with pytest.raises(InputError, match=r"--port 8571: .*192\.0\.2\.1.*--host"):
         require_free_ports({"--port": ("192.0.2.1", 8571)})
 

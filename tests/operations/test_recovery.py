@@ -34,7 +34,6 @@ from worldpose.formats.files import sha256_of_file
 from worldpose.store.blobs import LocalBlobs
 from worldpose.store.documents import seal
 from worldpose.store.integrity import repair, verify
-from worldpose.store.paths import queue_path
 from worldpose.store.run_queue import MAX_KILLS, MAX_SERVICE_DEATHS, RunQueue, queue_of
 from worldpose.store.store import Store
 
@@ -288,22 +287,18 @@ def test_a_frozen_run_is_ended_with_its_reason_and_restarts(queue, plan):
     assert liveness.alerts == []  # the queue has it
 
 
-def test_a_run_that_was_killed_while_it_was_suspended_waits_for_its_review(
-    queue, plan, monkeypatch
+@pytest.mark.parametrize(
+    ("kind", "said", "expected"),
+    [("PAUSED", "", "waiting"), ("CANCELLING", "cancelled by Ada", "cancelled")],
+)
+def test_a_run_that_was_killed_has_the_state_that_prefect_gave_it(
+    queue, plan, kind, said, expected
 ):
     run = queue.change(queue.take(a_run()), "begun", pid=None)
-    runs = SimpleNamespace(queue=queue)
-    assert not recovery._recover(plan, runs, run, {"state_type": "PAUSED"}, timedelta(0))
-    assert queue.latest(run).state == "waiting"
-
-
-def test_a_cancelled_run_that_was_killed_says_who_cancelled_it(queue, plan):
-    run = queue.change(queue.take(a_run()), "begun", pid=None)
     runs = SimpleNamespace(queue=queue, set_state=lambda *_: None)
-    there = {"state_type": "CANCELLING", "state": {"message": "cancelled by Ada"}}
+    there = {"state_type": kind, "state": {"message": said}}
     assert not recovery._recover(plan, runs, run, there, timedelta(0))
-    ended = queue.latest(run)
-    assert (ended.state, ended.message) == ("cancelled", "cancelled by Ada")
+    assert (queue.latest(run).state, queue.latest(run).message) == (expected, said)
 
 
 def test_a_process_with_the_number_of_a_run_is_not_taken_for_it(queue):
@@ -420,20 +415,6 @@ def test_a_resume_waits_for_a_run_that_is_about_to_be_suspended(monkeypatch, tmp
     assert next(states) == "SCHEDULED"
     monkeypatch.setattr(suspension.PrefectApi, "list_all", lambda *args, **more: [])
     assert suspension.resume_suspended(str(tmp_path), "m") == []
-
-
-@pytest.mark.slow
-def test_thousands_of_ended_runs_are_read_once_and_found_soon(queue, tmp_path):
-    for number in range(3000):
-        run = a_run(id=f"{number}", state="failed", match_id=f"m{number % 500}")
-        file = tmp_path / queue_path(run)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(seal(run))
-    queue.runs()
-    lost = queue.change(queue.take(a_run("lost")), "begun")
-    began = time.process_time()
-    assert queue.open_runs() == [lost]
-    assert time.process_time() - began < 1.0
 
 
 def test_what_stands_still_is_unhealthy(plan):

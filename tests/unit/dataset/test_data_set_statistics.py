@@ -405,31 +405,22 @@ def test_boxes_are_compared_in_the_same_view(reference, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("reference", "option"),
+    ("kind", "option"),
     [
-        ("joints.npz", "--run=3"),
-        ("joints.npz", "--first-frame=3"),
-        ("joints.npz", "--body=x"),
-        ("joints.npz", "--table=csv"),
+        *(("joints.npz", option) for option in ("--first-frame=3", "--body=x", "--table=csv")),
         ("a.zip", "--match-in=main"),
+        *(("folder", option) for option in ("--run=3", "--stage=body_fitting", "--markers=x")),
+        ("folder", "--method=a=x"),
     ],
 )
-def test_an_option_without_effect_on_files_is_refused(tmp_path, reference, option):
-    if reference == "a.zip":
-        write_submission(tmp_path / reference, {"A_1": np.zeros((1, 2, 15, 3))})
+def test_an_option_without_effect_is_refused(reference, tmp_path, kind, option):
+    side, named = tmp_path / kind, ""
+    if kind == "a.zip":
+        write_submission(side, {"A_1": np.zeros((1, 2, 15, 3))})
+    elif kind == "folder":
+        side, named = reference, "a="
     else:
-        tracks = JointTracks(np.arange(2), np.arange(1), np.zeros((2, 1, 17, 3)))
-        write_joints(tmp_path / reference, tracks)
-    file = tmp_path / reference
-    answer = run("--reference", file, "--prediction", file, option)
-    assert isinstance(answer.exception, UsageError)
-    assert option.split("=")[0] in str(answer.exception)
-
-
-@pytest.mark.parametrize(
-    "option", ["--run=3", "--stage=body_fitting", "--first-frame=3", "--markers=x", "--method=a=x"]
-)
-def test_an_option_without_effect_is_refused(reference, option):
-    answer = run("--reference", reference, "--prediction", f"a={reference}", option)
+        write_joints(side, JointTracks(np.arange(2), np.arange(1), np.zeros((2, 1, 17, 3))))
+    answer = run("--reference", side, "--prediction", f"{named}{side}", option)
     assert isinstance(answer.exception, UsageError)
     assert option.split("=")[0] in str(answer.exception)

@@ -199,25 +199,16 @@ def test_the_side_of_a_static_camera_lets_key_frames_be_proposed(match_folder, e
     assert match.proposed_views == match.calibrated_views == ("goal",)
 
 
-def test_units_lie_on_the_matchs_clock(spec):
+def test_units_lie_on_the_matchs_clock(match_folder, spec, make_people):
     # Clips span 5 to 8 and 9 to 11; cam2 runs 10 frames ahead; goal's own video starts at 0.
     clips = ((5, 3), (9, 2))
-    assert unit_frames(spec, "cam1") == UnitFrames(first=5, count=6, offset=0, ranges=clips)
     assert unit_frames(spec, "cam2") == UnitFrames(first=5, count=6, offset=10, ranges=clips)
     assert unit_frames(spec, "goal") == UnitFrames(first=5, count=3, offset=-5, ranges=((5, 3),))
-
-
-def test_a_static_camera_covers_all_clips_in_match_frames(match_folder, make_people):
     people, calibration = read_unit(read_match(match_folder), "cam1")
     np.testing.assert_array_equal(people.frame, [5, 6, 7, 9, 10])
     there = [0, 1, 2, 4, 5]  # nothing is kept of frame 8, which no clip has
     np.testing.assert_array_equal(people.keypoints, make_people(5, 6, seed=1).keypoints[there])
-    assert calibration is not None
     assert calibration.id == "cam1"
-
-
-def test_a_broadcast_camera_covers_its_clip(match_folder, make_people):
-    # Clip goal starts at match frame 5; its video starts at frame 0.
     people, calibration = read_unit(read_match(match_folder), "goal")
     np.testing.assert_array_equal(people.frame, [5, 6, 7])
     np.testing.assert_array_equal(people.keypoints, make_people(0, 3, seed=3).keypoints)
@@ -347,14 +338,11 @@ FIRST = "match.yaml: cameras[0]"
     [
         (match(fps=...), "match.yaml: fps", "a value", "nothing", "Add"),
         (match(fps=-1), "match.yaml: fps", "greater than or equal to 1", "-1", "Correct"),
-        (match(fps="25"), "match.yaml: fps", "a valid number", "'25'", "Correct"),
         (match(fps=math.nan), "match.yaml: fps", "a finite number", "nan", "Correct"),
         (match(match_id=12), "match.yaml: match_id", "a valid string", "12", "quotes: '12'"),
         (match(match_id=False), "match.yaml: match_id", "a valid string", "no, off", "'no'"),
         (match(match_id="../x"), "match.yaml: match_id", "letters", "'../x'", "Rename"),
-        (match(match_id="a" * 65), "match.yaml: match_id", "64", "aaa...", "Rename"),
         (match(contract=2), "match.yaml: contract", "1", "2", "version of worldpose"),
-        (match(cameras={"a": 1}), "match.yaml: cameras", "a valid array", "a mapping", "Correct"),
         (match(cameras=[camera(kind="fixed")]), f"{FIRST}.kind", "'broadcast'", "'fixed'", ""),
         (match(cameras=[camera(id=None)]), f"{FIRST}.id", "a valid string", "nothing", "Correct"),
         (
