@@ -10,13 +10,11 @@ import pytest
 from checker import half_written
 from test_killed_runs import assert_same_store
 
-from data_contracts.review import DeletedDetection
 from flows import iterate
 from flows import match as match_flow
 from flows.iterate import iterate_match
 from flows.match import task_of
 from flows.registering import open_match, register
-from flows.review.verdicts import correct
 from flows.run_record import RunLog
 from flows.running import RunRequest
 from flows.settings import selected_stages
@@ -109,66 +107,6 @@ def test_killed_at_a_random_commit_point_of_the_loop(seed, short, undisturbed, t
     assert half_written(project) == []
     loop(project, short, None)
     assert_same_store(project, reference)
-
-
-def delete_a_box(project):
-    store = Store.open(str(project))
-    (match_id,) = store.matches()
-    deleted = DeletedDetection(camera="cam01", frame=3, detection=0)
-    correct(store, open_match(store, match_id), [deleted], who="Ada", why="a shadow")
-
-
-def standing(project):
-    store = Store.open(str(project))
-    (match_id,) = store.matches()
-    return store.run(match_id).results
-
-
-def assert_every_run_is_of_one_piece(project):
-    """Inputs of a run's results are results of the same run, or of the previous pass.
-
-    A pass continues the previous one, whose runs are therefore included.
-    """
-    store = Store.open(str(project))
-    (match_id,) = store.matches()
-    records = [store.run(match_id, run) for run in store.runs(match_id)]
-    for record in records:
-        passes = [each.results for each in records if each.iteration == record.iteration - 1]
-        for name, key in record.results.items():
-            recipe = store.manifest(match_id, *name.split("/"), key).recipe
-            for source, made_from in recipe.inputs.items():
-                before = {results.get(source) for results in passes}
-                assert made_from == record.results.get(source) or made_from in before, name
-
-
-@pytest.fixture(scope="module")
-def edited(short, tmp_path_factory):
-    project = tmp_path_factory.mktemp("edited") / "project"
-    register(Store.create(str(project)), short)
-    delete_a_box(project)
-    loop(project, short, None)
-    return project
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(4))
-def test_an_edit_at_a_random_moment_of_the_loop(seed, short, undisturbed, edited, tmp_path):
-    reference, visits = undisturbed
-    moment = random.Random(seed).randrange(len(visits))
-    project = tmp_path / "project"
-    seen = []
-
-    def strike(point):
-        seen.append(point)
-        if len(seen) == moment + 1:
-            delete_a_box(project)
-
-    loop(project, short, strike)
-    assert len(seen) > moment
-    assert_every_run_is_of_one_piece(project)
-    assert standing(project) in (standing(reference), standing(edited))
-    loop(project, short, None)
-    assert standing(project) == standing(edited)
 
 
 @pytest.mark.parametrize("name", ["first", "further"])
