@@ -172,14 +172,6 @@ def _answers(number, seconds=0.1):
     return read
 
 
-def test_a_read_that_ends_between_two_calls_is_not_lost(short):
-    read = _answers(8)
-    assert patience.read_in_time("m", 0, read, "first", is_patient=False) == ("first", False)
-    time.sleep(0.6)
-    assert patience.read_in_time("m", 0, None, "first", is_patient=False) == ("found", False)
-    assert patience.LATE == {}  # the next one reads again
-
-
 def test_a_read_that_began_before_a_decision_does_not_answer_after_it(short):
     decided, wait = [], _answers(8)
 

@@ -179,15 +179,6 @@ def test_a_lens_that_no_coefficients_follow_leaves_out_its_camera(origins, monke
     assert "left out" in (tmp_path / "set" / "datasheet.html").read_text()
 
 
-def test_boxes_show_whom_the_camera_sees(written):
-    boxes = np.load(written / "set" / "train" / "boxes" / f"{CLIP}.npz")
-    there = np.isfinite(boxes["boxes"]).all(-1)
-    poses = np.load(written / "set" / "train" / "poses" / f"{CLIP}.npz")
-    np.testing.assert_array_equal(there, np.isfinite(poses["transl"][..., 0]).T)
-    np.testing.assert_array_equal(there, np.isfinite(boxes["visibility"]))
-    assert np.nanmax(boxes["visibility"]) == 1.0
-
-
 def test_people_behind_others_and_outside_the_image_are_less_visible(model, poses, main_camera):
     camera = main_camera[:HALF]
     one = fold_keypoints(model, COCO17)(poses[:1, :HALF]).swapaxes(0, 1)

@@ -233,10 +233,7 @@ def test_positions_may_be_in_an_archive(tmp_path):
 
 
 CONTAINERS = {
-    "asf": ("asf", "mpeg4", "yuv420p"),
     "mod": ("vob", "mpeg2video", "yuv420p"),
-    "nut": ("nut", "ffv1", "yuv420p"),
-    "y4m": ("yuv4mpegpipe", "wrapped_avframe", "yuv420p"),
     "": ("matroska", "mpeg4", "yuv420p"),
     "recording": ("mp4", "mpeg4", "yuv420p"),
 }
