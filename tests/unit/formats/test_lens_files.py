@@ -234,37 +234,29 @@ LENS = {"camera_matrix": MATRIX.tolist(), "dist": DISTORTION[0].tolist()}
 ENTRY = {"K": MATRIX.tolist(), "dist": DISTORTION[0].tolist(), "image_size": [1920, 1080]}
 
 
+VECTOR = {"intrinsics": [1400.0] * 4, "d": [0.1, 0.1, 0, 0, 0.1], "intrinsic_matrix": ENTRY["K"]}
+TABLE = {"rows": 3, "cols": 3, "data": MATRIX.ravel().tolist()}
+INLINE = f"dist = {LENS['dist']}\ncamera_matrix = {str(TABLE).replace(':', ' =')}\n".replace(
+    "'", ""
+)
+
+
 @pytest.mark.parametrize(
     ("name", "content"),
     [
-        ("names.json", json.dumps({**LENS, "cameras": ["a", "b"]})),
-        ("none.yaml", json.dumps({**LENS, "cameras": []})),
-        ("serials.json", json.dumps({**LENS, "cameras": {"left": {"serial": 1}}})),
-        ("order.json", json.dumps({**ENTRY, "intrinsics": [1.0] * 4, "intrinsic_matrix": [[0]]})),
-        (
-            "vector.json",
-            json.dumps(
-                {
-                    "intrinsics": [1400.0] * 4,
-                    "intrinsic_matrix": MATRIX.tolist(),
-                    "d": [0.1, 0.1, 0.0, 0.0, 0.1],
-                }
-            ),
-        ),
-        (
-            "meta.toml",
-            f"dist = {LENS['dist']}\nK = {LENS['camera_matrix']}\n[meta]\nsize = [1, 1]\n",
-        ),
-        (
-            "inline.toml",
-            f"dist = {LENS['dist']}\n"
-            f"camera_matrix = {{rows = 3, cols = 3, data = {MATRIX.ravel().tolist()}}}\n",
-        ),
-        ("spelt.json", json.dumps({**LENS, "cameraMatrix": MATRIX.tolist()})),
+        ("names.json", {**LENS, "cameras": ["a", "b"]}),
+        ("none.yaml", {**LENS, "cameras": []}),
+        ("serials.json", {**LENS, "cameras": {"left": {"serial": 1}}}),
+        ("order.json", {**ENTRY, "intrinsics": [1.0] * 4, "intrinsic_matrix": [[0]]}),
+        ("vector.json", VECTOR),
+        ("meta.toml", f"dist = {LENS['dist']}\nK = {ENTRY['K']}\n[meta]\nsize = [1, 1]\n"),
+        ("inline.toml", INLINE),
+        ("spelt.json", {**LENS, "cameraMatrix": MATRIX.tolist()}),
     ],
 )
 def test_a_file_with_a_matrix_of_its_own_has_one_lens(name, content, tmp_path):
-    (tmp_path / name).write_text(content)
+    text = content if isinstance(content, str) else json.dumps(content)
+    (tmp_path / name).write_text(text)
     assert read_lenses([tmp_path / name], "left", SIZES)["left"].focal_px == 1402.0
 
 
