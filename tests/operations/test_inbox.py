@@ -329,10 +329,7 @@ def describe(text):
 EVIL_ID = "match_id: ../../evil\nfps: 25\ncameras: []\nclips: []"
 HOSTILE = {
     "a link to a match": (link_to_itself, "it is a link"),
-    "a link to a file": (
-        lambda at: (at / "secrets").symlink_to("/etc/passwd"),
-        "secrets is a link",
-    ),
+    "a link": (lambda at: (at / "reference/x").symlink_to("/etc/passwd"), "reference/x is a link"),
     "a link to a folder": (lambda at: (at / "videos").symlink_to("/"), "videos is a link"),
     "a pipe": (lambda at: os.mkfifo(at / "calibration.toml"), "neither a file nor a folder"),
     "a socket": (bind_socket, "neither a file nor a folder"),
