@@ -95,6 +95,25 @@ def test_a_silent_file_is_told_by_its_lengths_on_each_route(tmp_path, names, kin
         assert_body(found.people)
 
 
+@pytest.mark.parametrize("change", ["faceless", "foreshortened"])
+def test_an_order_is_told_without_faces_and_of_people_seen_from_the_side(tmp_path, change):
+    folder = frames(tmp_path / "a_json", BODY_25B)
+    for file in folder.iterdir():
+        content = json.loads(file.read_text())
+        triples = np.reshape(content["people"][0]["pose_keypoints_2d"], (25, 3))
+        if change == "faceless":
+            triples[:3] = 0.0
+        else:
+            triples[9:11] = 0.5 * (triples[7:9] + triples[9:11])  # forearms towards the camera
+            triples[1:3] = 3.0 * triples[1:3] - 2.0 * triples[0]
+            triples[:, 2] = 0.9
+        content["people"][0]["pose_keypoints_2d"] = triples.ravel().tolist()
+        file.write_text(json.dumps(content))
+    found = read_openpose_folder(folder)
+    assert found.kind == "BODY_25B"
+    np.testing.assert_allclose(found.people.keypoints[0, 0, 15], (530, 690))
+
+
 @pytest.mark.parametrize(
     "hidden",
     ["knee|ankle", "elbow|wrist", "nose|eye|knee|ankle", "nose|eye|ear|shoulder"],

@@ -22,7 +22,7 @@ from worldpose.ingest.importing import import_match, import_videos
 from worldpose.ingest.match_folder import read_match
 from worldpose.parsing import read_cells
 from worldpose.video.files import VideoReader, holds_video
-from worldpose.video.folder import numbered_images
+from worldpose.video.folder import numbered_images, open_video
 from worldpose.video.names import frame_numbers
 
 SIZE = (48, 64)
@@ -35,6 +35,14 @@ def level(number, size=SIZE):
 
 def number_of(picture):
     return round((float(picture.mean()) - 10) / 16)
+
+
+def test_images_are_in_the_order_of_the_numbers_in_their_names(tmp_path):
+    for number in (7, 9, 12):
+        cv2.imwrite(str(tmp_path / f"img ({number}).png"), level(number))
+    with open_video(tmp_path) as video:
+        assert [number_of(shown) for _, shown in video.frames()] == [7, 9, 12]
+        assert video.index.on_clock(25.0, "images").tolist() == [0, -1, 1, -1, -1, 2]
 
 
 @pytest.mark.parametrize(
