@@ -6,6 +6,7 @@ import time
 import urllib.request
 from http.cookiejar import CookieJar
 from urllib.parse import quote
+from uuid import uuid4
 
 import pytest
 from service import TOKEN, Served, fetch, request
@@ -137,3 +138,33 @@ def test_no_other_session_opens_prefect(served):
         stream.send(json.dumps({"type": "auth", "token": None}))
         with pytest.raises(Exception, match="1008"):
             stream.recv(30)
+
+
+def test_the_form_at_the_dashboard_opens_the_pages_too(served):
+    pages, prefect = served.ports["pages"], served.ports["prefect"]
+    assert b'id="token"' in request(prefect, "GET", "/login", PAGE)[2]
+    assert request(prefect, "GET", "/api/session")[0] == 401
+    foreign = {"origin": f"http://127.0.0.1:{pages}"}
+    given = {"who": "Ada", "token": TOKEN + "Ada"}
+    assert request(prefect, "POST", "/api/login", foreign, given)[0] == 403
+    assert request(prefect, "POST", "/api/login", {}, {**given, "token": TOKEN})[0] == 401
+    assert request(prefect, "POST", "/api/login", {}, {"who": "\ud800"})[0] == 422
+    ada = log_in(prefect, "Ada")
+    assert request(prefect, "GET", "/api/session", ada)[0] == 200
+    assert request(prefect, "GET", "/api/admin/version", ada)[0] == 200
+    assert request(pages, "GET", "/api/matches", ada)[0] == 200
+    for path in ("/api/health", "/api/ready"):
+        assert request(prefect, "GET", path, PAGE)[0] == 200
+    gone = f"/api/flow_runs/{uuid4()}"
+    own = {"origin": f"http://127.0.0.1:{prefect}"}
+    assert request(prefect, "DELETE", gone, {**ada, **own})[0] == 404
+    vera = log_in(prefect, "Vera")
+    status, _, session = request(prefect, "GET", "/api/session", vera)
+    assert status == 401
+    secret = {"x-form-secret": json.loads(session)["form_secret"]}
+    assert request(pages, "GET", "/api/session", vera)[0] == 200
+    assert request(prefect, "POST", "/api/logout", {**vera, **secret}, {})[0] == 200
+    assert request(pages, "GET", "/api/session", vera)[0] == 401
+    log = (served.project / "operations" / "logs" / "prefect.log").read_text()
+    for line in ("POST /api/login': 200", f"DELETE {gone}': 404"):
+        assert f"Ada: '{line}" in log

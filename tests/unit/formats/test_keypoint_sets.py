@@ -316,6 +316,22 @@ def test_pictures_of_one_number_are_refused_and_frame_id_helps_out(tmp_path):
         read_coco_results(tmp_path / "b.json")
 
 
+def test_annotations_without_points_and_people_of_nan_are_nobody(tmp_path):
+    path = data_set(tmp_path / "a.json", [{"id": 3, "file_name": "a_5.jpg"}])
+    content = json.loads(path.read_text())
+    nan = {"image_id": 3, "keypoints": [float("nan")] * 51, "score": float("nan")}
+    ball = {"image_id": 3, "bbox": [1, 2, 3, 4]}
+    content["annotations"] += [ball, nan]
+    path.write_text(json.dumps(content))
+    found = read_coco_results(path)
+    assert (found.people.score.shape, found.changes) == ((1, 1), (0, 1, 0, 1, 0))
+    said = str(describe_changes({"a": found}))
+    assert "annotations without keypoints, such as of the ball" in said
+    path.write_text(json.dumps(content | {"annotations": [ball, {**ball, "keypoints": []}]}))
+    with pytest.raises(InputError, match="expected keypoints of people, found 2 annotations"):
+        read_coco_results(path)
+
+
 def test_people_with_a_box_alone_are_told(tmp_path):
     result = {"image_id": 3, "category_id": 1, "keypoints": [0] * 51, "bbox": [1, 2, 30, 40]}
     (tmp_path / "a.json").write_text(json.dumps([result, result]))

@@ -4,6 +4,7 @@ import itertools
 import json
 import shutil
 
+import cv2
 import numpy as np
 import pytest
 from run_records import calibration
@@ -207,6 +208,15 @@ def test_synchronised_poses_give_the_clock_of_the_videos(trial, tmp_path, has_ra
     people, _ = read_unit(read_match(tmp_path / "m"), "cam02")
     found = people.keypoints[list(people.frame).index(3), 0]
     np.testing.assert_allclose(found, person(26, 200)[1][:, :2], rtol=1e-6)
+
+
+def test_images_without_a_rate_are_refused_by_the_file_that_lacks_it(trial, tmp_path):
+    for name in CAMERAS:
+        (trial / "videos" / name).mkdir(parents=True)
+        cv2.imwrite(str(trial / "videos" / name / "0.png"), np.zeros((1920, 1088, 3), np.uint8))
+    (trial / "Config.toml").unlink()
+    with pytest.raises(InputError, match=r"Config.toml: project.frame_rate: expected frames per"):
+        import_pose2sim(trial, tmp_path / "m")
 
 
 def people_of(*values):
