@@ -1,4 +1,4 @@
-"""A season of `worldpose serve` in minutes: history, kills, restarts, settings; many units."""
+"""A season of `worldpose serve` in minutes: history, kills, restarts, settings."""
 
 import random
 import shutil
@@ -6,16 +6,18 @@ import signal
 import subprocess
 import time
 import urllib.request
+from dataclasses import replace
 from functools import partial
 
 import psutil
 import pytest
-from command_line import TINY, WORLDPOSE
+from command_line import TINY, WORLDPOSE, succeed
 from faults.checker import doubled
 from many_matches import copy_match, queue_history
 from service import Browser, wait_until
 
 from flows.registering import register
+from worldpose.body.body_file import load_open_body, save_body
 from worldpose.simulation.matches import MatchOptions, simulate_match
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.store.blobs import LocalBlobs
@@ -131,3 +133,66 @@ def test_a_service_killed_at_random_moments_loses_and_doubles_nothing(served, ma
         assert any(f"/#/match/{run['parameters']['match_id']})" in each["data"] for each in found)
     assert [store.run(name).state for name in everything] == ["complete"] * 3
     assert (list(doubled(store)), list(verify(store)), served.end()) == ([], [], 0)
+
+
+def schedules(served):
+    found = served.ask("/deployments/name/reprocess/worldpose-reprocess")
+    keep = ("id", "slug", "active", "schedule")
+    kept = [{name: each[name] for name in keep} for each in found["schedules"]]
+    return sorted(kept, key=lambda each: each["id"])
+
+
+def test_schedules_and_settings_outlast_two_restarts(served, small_match, tmp_path):
+    bodies = tmp_path / "bodies"
+    bodies.mkdir()
+    save_body(bodies / "smpl-test.npz", replace(load_open_body(), name="smpl-test"))
+    stated = ("body_fitting.body_model=smpl-test", "iterations=2", "detection.stride=2")
+    stated = (*stated, "tracking.gate_m=0.6", "gates=never", f"body_folder={bodies}")
+    options = [text for each in stated for text in ("--set", each)]
+    alone = tmp_path / "alone"
+    succeed("init", alone)
+    succeed("settings", *options, "--project", alone)
+    succeed("run", small_match, "--project", alone)
+    own = Store.open(alone)
+    (match_id,) = own.matches()
+    expected = [own.run(match_id, run_id).results for run_id in own.runs(match_id)]
+    assert {len(own.runs(match_id))} <= {2, 3}
+
+    succeed("init", served.project)
+    succeed("settings", *options, "--project", served.project)
+    served.options = {"--workers": 1, "--schedule": "reprocess=0 3 * * * Europe/Vienna"}
+    served.begin()
+    made = schedules(served)
+    assert [each["schedule"]["cron"] for each in made] == ["0 3 * * *"]
+    shutil.copytree(small_match, served.project / "inbox" / ".small")
+    (served.project / "inbox" / ".small").rename(served.project / "inbox" / "small")
+    store = Store.open(served.project)
+
+    def completed(count):
+        runs = served.runs(match_id)
+        assert not [run for run in runs if run["state_type"] in ("FAILED", "CRASHED")], runs
+        return sum(run["state_type"] == "COMPLETED" for run in runs) >= count
+
+    wait_until(lambda: completed(1), served.explain)
+    found = [store.run(match_id, run_id).results for run_id in store.runs(match_id)]
+    assert (found, store.run(match_id).body_folder) == (expected, str(bodies))
+    # A person makes a schedule of their own, in Prefect's page or by its API.
+    other = {"interval": 86400.0, "timezone": "Asia/Tokyo"}
+    deployment = served.ask("/deployments/name/reprocess/worldpose-reprocess")["id"]
+    served.ask(f"/deployments/{deployment}/schedules", [{"schedule": other, "active": True}])
+    before = schedules(served)
+    assert len(before) == 2
+    for options in ({"--workers": 1}, served.options):
+        assert served.end() == 0
+        served.options = options
+        served.begin()
+        assert schedules(served) == before
+    # By a page and by a schedule's run, nothing is left to compute: the keys are the same.
+    Browser(served).ask(f"/api/matches/{match_id}/runs", {"gates": "auto"})
+    wait_until(lambda: completed(2), served.explain)
+    run = served.ask(f"/deployments/{deployment}/create_flow_run", {"name": "nightly"})
+    asked = f"/flow_runs/{run['id']}"
+    wait_until(lambda: served.ask(asked)["state_type"] == "COMPLETED", served.explain)
+    assert (len(store.runs(match_id)), served.end()) == (len(found), 0)
+    told = succeed("reprocess", "--dry-run", "--project", served.project, "--json").json
+    assert [each["state"] for each in told["matches"]] == ["untouched"]
