@@ -298,7 +298,8 @@ def test_a_run_that_was_killed_has_the_state_that_prefect_gave_it(
     runs = SimpleNamespace(queue=queue, set_state=lambda *_: None)
     there = {"state_type": kind, "state": {"message": said}}
     assert not recovery._recover(plan, runs, run, there, timedelta(0))
-    assert (queue.latest(run).state, queue.latest(run).message) == (expected, said)
+    ended = queue.latest(run)
+    assert ended.state == expected and ended.message.startswith(said)
 
 
 def test_a_process_with_the_number_of_a_run_is_not_taken_for_it(queue):
