@@ -169,7 +169,7 @@ def fetch(address, body=None, headers=None, opener=None):
     return json.loads(content) if kind.startswith("application/json") else content.decode()
 
 
-def wait_until(is_so, explain=str):
+def wait_until(is_so, explain=str, pause=2.0):
     deadline = time.monotonic() + PATIENCE
     troubles = []
     while True:
@@ -183,4 +183,4 @@ def wait_until(is_so, explain=str):
         if found:
             return found
         assert time.monotonic() < deadline, explain()
-        time.sleep(2.0)
+        time.sleep(pause)

@@ -29,7 +29,6 @@ def small_match(tmp_path_factory):
 
 @pytest.fixture
 def drop(small_match, tmp_path):
-    """A function that puts a copy of the match into the inbox."""
     (tmp_path / "inbox").mkdir()
 
     def copy(name="small"):

@@ -66,7 +66,6 @@ def limits(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def images(limits, tmp_path_factory):
-    """Build all images; podman keeps the layers of earlier builds."""
     folder = tmp_path_factory.mktemp("images")
     if not podman("images", "--quiet", BASE):
         packages = "--include=python3,python3-venv,ca-certificates"
@@ -192,7 +191,6 @@ def deployment(images, tmp_path):
 
 
 def log_in(deployment):
-    """Somebody on the pages; None while the container starts."""
     try:
         return Browser(deployment)
     except (urllib.error.URLError, ConnectionError):

@@ -6,24 +6,24 @@ import platform
 import shutil
 from contextvars import copy_context
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from threading import Thread
 from uuid import uuid4
 
 import anyio
 import pytest
+import service
 from command_line import TINY
 from prefect import Flow
 from prefect.client.schemas.objects import FlowRun
 from prefect.flow_runs import resume_flow_run
 from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
-from service import wait_until
 
 from data_contracts.review import ReviewDecision
 from flows.orchestration.prefect_api import UnreachablePrefectError, of_types
 from flows.registering import register
 from flows.service import recovery
-from flows.service.alerts import alerts_now
 from flows.service.deployed import release_folder
 from flows.service.deployments import DEPLOYED, install
 from flows.service.layout import is_alive
@@ -39,10 +39,11 @@ from worldpose.review.journal import read_journal
 from worldpose.store.runs import alone
 from worldpose.store.store import Store
 
+wait_until = partial(service.wait_until, pause=0.05)
+
 
 @pytest.fixture(scope="module")
 def plan(server, tmp_path_factory):
-    """A plan whose deployments are installed."""
     # One folder, however often a process comes back to these tests: the server serves one project.
     folder = tmp_path_factory.getbasetemp() / "of-deployments"
     Store.create(folder)
@@ -158,7 +159,7 @@ def test_a_schedule_of_serve_is_made_changed_by_the_option_alone_and_never_remov
         "0 3 * * *",
         "Europe/Vienna",
     )
-    assert start(night) == start(night) == [made]
+    assert start(night) == [made]
     # A person pauses it, and adds another one: both stay, whatever the service is started with.
     place = f"/deployments/{made['deployment_id']}/schedules"
     prefect.ask(f"{place}/{made['id']}", {"active": False}, method="PATCH")
@@ -320,7 +321,6 @@ def test_a_release_lies_in_the_project_under_a_name_that_leads_nowhere_else(tmp_
 
 @pytest.fixture
 def lonely(plan, tmp_path):
-    """The plan with a queue of its own, and its runs."""
     own = plan.model_copy(update={"project": str(tmp_path), "state": tmp_path / "operations"})
     Store.create(own.project)
     return own, MatchRuns.of_plan(own)
@@ -384,18 +384,6 @@ def test_every_run_is_recovered_whatever_becomes_of_prefects_history(lonely):
     # A worker that takes such a run finds its former states.
     taken = [queued_run("match", run) for run in there.values()]
     assert {prefect.queue.take(run).id for run in taken} == {asked.id, begun.id, waits.id}
-
-
-def test_a_run_that_keeps_being_killed_is_left_for_a_person(lonely):
-    plan, prefect = lonely
-    run = prefect.start("poison")
-    for _ in range(3):
-        prefect.queue.change(prefect.queue.latest(run), "begun", **{**DEAD, "worker_pid": None})
-        killed = prefect.queue.kill(prefect.queue.latest(run), "killed")
-        recover(plan)
-    assert (killed.state, killed.message) == ("failed", "killed; it was begun 3 times")
-    (alert,) = alerts_now(plan.model_copy(update={"disk_gb": 0.0}), [], [], prefect.queue.runs())
-    assert (alert.alert, alert.match_id) == ("run_failed", "poison")
 
 
 def test_a_run_that_a_person_retries_at_prefect_is_asked_for_again(lonely):

@@ -174,21 +174,12 @@ def test_a_taken_port_is_named_with_the_next_free_one(chosen):
     require_free_ports(wanted)
 
 
-def test_a_port_for_two_parts_is_refused():
+def test_a_port_for_two_parts_and_a_foreign_address_are_refused():
     (port,) = free_ports(1)
     with pytest.raises(InputError, match=f"--metrics-port {port}: .*another program"):
         require_free_ports({"--port": (HOST, port), "--metrics-port": (HOST, port)})
-
-
-def test_a_foreign_address_is_refused_as_one():
     with pytest.raises(InputError, match=r"--port 8571: .*192\.0\.2\.1.*--host"):
         require_free_ports({"--port": ("192.0.2.1", 8571)})
-
-
-def test_pages_at_a_taken_port_print_no_address(tiny_run, taken):
-    answer = worldpose("review", "serve", "--project", tiny_run, "--port", taken)
-    assert (answer.code, answer.out) == (1, "")
-    assert f"--port {taken}: expected a free port" in answer.err
 
 
 def test_a_service_with_a_taken_port_starts_nothing(tmp_path, taken):
@@ -237,7 +228,6 @@ DASHBOARD = INFRA / "grafana" / "worldpose.json"
 
 
 def scraped(text):
-    """Samples by name and labels, as Prometheus itself reads them."""
     return {
         (sample.name, *sorted(sample.labels.items())): sample.value
         for family in text_string_to_metric_families(text)
@@ -247,7 +237,6 @@ def scraped(text):
 
 @pytest.fixture
 def served(project_copy):
-    """A served project, and a function that queries its metrics server."""
     state = StateFolder(project_copy / "operations")
     now = datetime.now(UTC)
     for name, known in (("a", "taken"), ("b", "refused"), ("c", "refused")):
@@ -344,11 +333,9 @@ def test_what_is_scraped_again_is_looked_at_anew(project_copy):
 
 
 def test_a_project_in_object_storage_is_told_of_the_disk_of_its_state(bucket, tmp_path):
-    store = Store.create(f"{bucket}/disk")
-    found = scraped(exposition(ProjectMetrics(Overview(store), StateFolder(tmp_path))).decode())
-    assert found["worldpose_disk_free_bytes",] == pytest.approx(
-        shutil.disk_usage(tmp_path).free, rel=0.05
-    )
+    figures = ProjectMetrics(Overview(Store.create(f"{bucket}/disk")), StateFolder(tmp_path))
+    free = scraped(exposition(figures).decode())["worldpose_disk_free_bytes",]
+    assert free == pytest.approx(shutil.disk_usage(tmp_path).free, rel=0.05)
 
 
 TOKEN = "a token of twenty-four.."

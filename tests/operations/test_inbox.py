@@ -232,7 +232,6 @@ def test_a_second_copy_is_refused_with_the_name_of_the_first(desk, drop):
 
 
 def take_in_and_die(folder, poisoned):
-    """A process that dies, as from the system's out-of-memory killer, when it reads one match."""
     from flows.service import inbox
 
     register = inbox.register
@@ -324,37 +323,22 @@ def name_pitch_outside(folder):
 
 
 def describe(text):
-    """A function that replaces the description of a match."""
     return lambda folder: (folder / "match.yaml").write_text(text)
 
 
+EVIL_ID = "match_id: ../../evil\nfps: 25\ncameras: []\nclips: []"
 HOSTILE = {
     "a link to a match": (link_to_itself, "it is a link"),
-    "a link to a file": (
-        lambda folder: (folder / "reference" / "secrets").symlink_to("/etc/passwd"),
-        "reference/secrets is a link",
-    ),
-    "a link to a folder": (lambda folder: (folder / "videos").symlink_to("/"), "videos is a link"),
-    "a pipe": (
-        lambda folder: os.mkfifo(folder / "calibration.toml"),
-        "neither a file nor a folder",
-    ),
+    "a link": (lambda at: (at / "reference/x").symlink_to("/etc/passwd"), "reference/x is a link"),
+    "a link to a folder": (lambda at: (at / "videos").symlink_to("/"), "videos is a link"),
+    "a pipe": (lambda at: os.mkfifo(at / "calibration.toml"), "neither a file nor a folder"),
     "a socket": (bind_socket, "neither a file nor a folder"),
-    "a name with a line break": (lambda folder: (folder / "a\nb").touch(), "characters"),
-    "a name that is no text": (
-        lambda folder: (folder / os.fsdecode(b"\xff\xfe")).touch(),
-        "characters",
-    ),
+    "a name with a line break": (lambda at: (at / "a\nb").touch(), "characters"),
+    "a name that is no text": (lambda at: (at / os.fsdecode(b"\xff\xfe")).touch(), "characters"),
     "a file": (become_file, "it is a file"),
     "a path out of it": (name_pitch_outside, "without .."),
-    "an id that is a path": (
-        describe("match_id: ../../evil\nfps: 25\ncameras: []\nclips: []"),
-        "match_id",
-    ),
-    "code in the description": (
-        describe("!!python/object/apply:os.system ['touch /tmp/evil']"),
-        "match.yaml",
-    ),
+    "an id that is a path": (describe(EVIL_ID), "match_id"),
+    "code in it": (describe("!!python/object/apply:os.system ['touch /tmp/evil']"), "match.yaml"),
     "deep nesting": (describe("[" * 100_000), "match.yaml"),
 }
 

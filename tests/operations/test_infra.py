@@ -67,7 +67,7 @@ LOGINS = {
 """Services of compose that people reach, and what each asks for its login in."""
 
 
-def test_compose_publishes_only_what_asks_for_a_login():
+def test_compose_publishes_only_what_asks_for_a_login_and_gives_tokens_to_serve_alone():
     for name, service in SERVICES.items():
         is_published = "ports" in service
         assert is_published == (name in LOGINS), name
@@ -81,9 +81,6 @@ def test_compose_publishes_only_what_asks_for_a_login():
     assert SERVICES["serve"]["environment"]["PREFECT_API_AUTH_STRING"] == login
     guarded = ["python", "-m", "flows.orchestration.prefect_server"]
     assert SERVICES["prefect"]["entrypoint"][:3] == guarded
-
-
-def test_compose_gives_alerts_and_tokens_to_serve_alone():
     for name, service in SERVICES.items():
         given = set(service.get("environment", {}))
         held = {each for each in given if re.search("REVIEW|METRICS_TOKEN|ALERT", each)}
@@ -234,7 +231,6 @@ def test_kubernetes_manifests_refer_to_what_is_there():
 
 
 def needs(tool):
-    """A mark: set-ups are checked by their own tools if installed."""
     return pytest.mark.skipif(shutil.which(tool) is None, reason=f"{tool} is not installed")
 
 

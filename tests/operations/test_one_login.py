@@ -37,7 +37,6 @@ def served(tmp_path_factory):
 
 
 def log_in(port, who):
-    """The cookie of a new session, as a request's headers."""
     jar = CookieJar()
     opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor(jar))
     given = {"who": who, "token": TOKEN + who}
@@ -47,7 +46,6 @@ def log_in(port, who):
 
 
 def session_of(served, who, now=None, token=TOKEN):
-    """The cookie of a session that nobody has logged in to."""
     users = served.options["--users"]
     access = access_for("127.0.0.1", token=token, names=(), secure=False, users=users)
     name = access_for("127.0.0.1", token=TOKEN, names=(), secure=False).cookie
@@ -55,7 +53,6 @@ def session_of(served, who, now=None, token=TOKEN):
 
 
 def opened(served, cookie, first=None):
-    """A WebSocket of Prefect's logs, as its dashboard's pages would open it."""
     port = served.ports["prefect"]
     stream = connect(
         f"ws://127.0.0.1:{port}/api/logs/out",

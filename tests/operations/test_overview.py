@@ -26,7 +26,6 @@ from worldpose.store.store import Store
 
 @pytest.fixture
 def store(project_copy, tmp_path):
-    """A project with one match, which nobody else reads."""
     store = Store.open(str(project_copy))
     folder = store.registration(TINY).folder
     own = shutil.copytree(folder, tmp_path / "own", ignore=shutil.ignore_patterns("reference"))

@@ -25,7 +25,6 @@ LOGIN = new_login()
 
 @pytest.fixture
 def prefect_on_postgres(postgres, tmp_path):
-    """The address of a Prefect server whose database is Postgres."""
     api = f"http://127.0.0.1:{free_ports(1)[0]}/api"
     plan = ServePlan(project="none", inbox=tmp_path, state=tmp_path, prefect=api)
     environment = served_environment(api, tmp_path / "prefect")

@@ -27,7 +27,6 @@ pytestmark = [
 
 @pytest.fixture
 def slurm(tmp_path):
-    """The environment in which SLURM's commands reach a cluster of two nodes."""
     host = socket.gethostname().partition(".")[0]
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]

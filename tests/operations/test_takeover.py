@@ -42,7 +42,6 @@ def served(tmp_path_factory):
 
 @pytest.fixture
 def pwned(tmp_path):
-    """A file that an attack would make, and a shell command that makes it."""
     file = tmp_path / "PWNED"
     return file, f'/bin/sh -c "id > {file}; env >> {file}"'
 
@@ -52,7 +51,6 @@ def basic(login):
 
 
 def strangers(login):
-    """Headers of clients without the login, and of other sites' pages even with it."""
     return {
         "no login": {},
         "wrong login": basic("worldpose:wrong"),
@@ -76,7 +74,6 @@ def deployment_of(served, flow="ingest"):
 
 
 def settle(served, runs):
-    """The states in which runs end."""
     wait = ("SCHEDULED", "PENDING", "RUNNING")
 
     def ended():

@@ -7,14 +7,15 @@ import shutil
 import time
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from threading import Event, active_count
 from types import SimpleNamespace
 
 import pytest
+import service
 from command_line import worldpose
 from fastapi import HTTPException
 from page_client import HERE, TOKEN, TestClient, browser, log_in, served
-from service import wait_until
 from stalled_disk import stalled
 from starlette.responses import Response
 
@@ -37,6 +38,8 @@ from flows.web.intake import NewDraft
 from worldpose.store.run_queue import queue_of
 from worldpose.store.runs import alone
 from worldpose.store.store import Store
+
+wait_until = partial(service.wait_until, pause=0.05)
 
 
 @pytest.fixture
@@ -86,7 +89,6 @@ def test_pages_show_the_others_beside_a_stale_mount(stale_mount):
 
 @pytest.fixture
 def silent(monkeypatch, two):
-    """A function that lets the disk of the first match answer: before, no stat or read ends."""
     monkeypatch.setattr(patience, "SILENT_SECONDS", 0.5)
     monkeypatch.setattr(patience, "SHORT_SECONDS", 0.2)
     stat, answers, file = os.stat, Event(), two / "first" / "match.yaml"
@@ -168,14 +170,6 @@ def _answers(number, seconds=0.1):
         return "found"
 
     return read
-
-
-def test_a_read_that_ends_between_two_calls_is_not_lost(short):
-    read = _answers(8)
-    assert patience.read_in_time("m", 0, read, "first", is_patient=False) == ("first", False)
-    time.sleep(0.6)
-    assert patience.read_in_time("m", 0, None, "first", is_patient=False) == ("found", False)
-    assert patience.LATE == {}  # the next one reads again
 
 
 def test_a_read_that_began_before_a_decision_does_not_answer_after_it(short):

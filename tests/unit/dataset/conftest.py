@@ -89,7 +89,6 @@ def written(model, poses, cameras, main_camera, tmp_path_factory):
 
 @pytest.fixture
 def data_set(written, tmp_path):
-    """Gives a copy of a data set to be spoilt."""
 
     def copy(kind):
         return shutil.copytree(written / kind, tmp_path / kind)

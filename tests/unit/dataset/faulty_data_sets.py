@@ -26,7 +26,6 @@ def findings(folder, model, pitch=True):
 
 
 def edit(path, change):
-    """Change the arrays of an npz file in place."""
     with np.load(path) as file:
         arrays = {name: file[name] for name in file.files}
     change(arrays)

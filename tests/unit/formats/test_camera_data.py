@@ -250,7 +250,6 @@ def test_what_was_written_is_read_again(tmp_path):
 
 
 def moving(rows=3):
-    """Arrays of a camera that zooms."""
     k = np.tile(np.eye(3), (rows, 1, 1))
     k[:, 0, 0] = k[:, 1, 1] = 2000.0 + 10.0 * np.arange(rows)
     k[:, :2, 2] = 960.0, 540.0

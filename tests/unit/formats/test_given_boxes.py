@@ -6,7 +6,6 @@ from camera_builders import plain_camera
 
 from worldpose.errors import InputError
 from worldpose.formats.annotations.marked_images import SOCCERNET_MARKINGS, read_marked_images
-from worldpose.formats.baselines.result import write_tracks
 from worldpose.formats.detection_files import read_boxes
 from worldpose.formats.joints_file import JointTracks
 from worldpose.formats.motion_capture import coco_dataset
@@ -32,18 +31,6 @@ def test_lines_become_boxes_sorted_by_frame(read):
     # (1, 1) there is the corner of the first pixel, (0, 0) here its centre.
     np.testing.assert_allclose(found.box, [[0.0, 0.0, 4.0, 8.0], [10.0, 20.0, 20.0, 40.0]])
     np.testing.assert_allclose(found.score, [1.0, 0.9])
-
-
-def test_our_own_tracks_are_read_back(tmp_path):
-    rng = np.random.default_rng(3)
-    corner = rng.uniform(0, 300, (5, 3, 2))
-    boxes = np.concatenate([corner, corner + rng.uniform(5, 100, (5, 3, 2))], axis=-1)
-    boxes[2, 1] = np.nan
-    write_tracks(tmp_path / "t.txt", boxes, np.array([0, 4, 9]), np.arange(12, 17))
-    found = read_boxes(tmp_path / "t.txt", SIZE, 17)
-    assert set(found.frame) == set(range(12, 17))
-    np.testing.assert_allclose(found.box, boxes[np.isfinite(boxes).all(-1)], atol=0.0101)
-    assert found.person.tolist() == [1, 5, 10] * 2 + [1, 10] + [1, 5, 10] * 2
 
 
 def test_boxes_outside_and_confidences_above_one_are_counted(read):

@@ -228,7 +228,6 @@ MAX_JOINT_M, MAX_ROTATION_DEG = 1e-4, 0.01
 
 
 def pose_in_node(clip, folder):
-    """What the script of the page makes of all parts of a clip."""
     parts = [folder / "scene"]
     parts[0].write_bytes(encode_scene(clip))
     for first in range(0, len(clip.frames), clip.range_frames):

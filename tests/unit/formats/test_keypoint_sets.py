@@ -55,14 +55,12 @@ def points(names, confidence=0.9):
 
 
 def results(path, names, **more):
-    """Write a list of results of two frames."""
     people = [{"image_id": n, "keypoints": points(names), **more} for n in (0, 1)]
     path.write_text(json.dumps(people))
     return path
 
 
 def frames(folder, names, count=2, key="pose_keypoints_2d"):
-    """Write a folder of OpenPose's frames."""
     folder.mkdir()
     for n in range(count):
         text = json.dumps({"people": [{key: points(names)}]})
@@ -71,7 +69,6 @@ def frames(folder, names, count=2, key="pose_keypoints_2d"):
 
 
 def assert_body(people):
-    """Assert that the first person has each joint of COCO-17 at its place."""
     wanted = np.array([BODY[name] for name in COCO17]) + (500, 300)
     np.testing.assert_allclose(people.keypoints[0, 0], wanted)
     if people.points:
@@ -165,11 +162,12 @@ def test_neck_and_top_of_the_head_in_place_of_eyes_are_no_eyes(tmp_path):
     assert np.isfinite(found.people.confidence[0, 0]).tolist() == [False] * 5 + [True] * 12
 
 
-def test_a_stated_model_counts_if_its_size_fits(tmp_path):
+def test_a_stated_model_counts_if_it_is_known_and_its_size_fits(tmp_path):
     folder = frames(tmp_path / "a_json", BODY_25B)
-    assert read_openpose_folder(folder, "BODY_25B").kind == "BODY_25B"
     assert read_openpose_folder(folder, "BODY_25").kind == "BODY_25"
     assert read_openpose_folder(folder, "Body_with_feet").kind == "BODY_25B"
+    with pytest.raises(InputError, match="of model 'MY_NET' have another order"):
+        read_openpose_folder(frames(tmp_path / "b", COCO17[::-1]), "MY_NET")
 
 
 @pytest.mark.parametrize(
@@ -252,12 +250,6 @@ def test_a_set_may_lack_the_face(tmp_path):
         read_openpose_folder(frames(tmp_path / "c", MPI[::-1]))
 
 
-def test_a_stated_model_that_is_not_known_needs_usual_lengths(tmp_path):
-    assert read_openpose_folder(frames(tmp_path / "a", COCO17), "MY_NET").kind == "COCO-17"
-    with pytest.raises(InputError, match="of model 'MY_NET' have another order"):
-        read_openpose_folder(frames(tmp_path / "b", COCO17[::-1]), "MY_NET")
-
-
 def test_landmarks_of_two_faces_are_no_bodies(tmp_path):
     jaw = np.linspace(np.pi, 0, 17)
     around = np.linspace(0, 2 * np.pi, 51)
@@ -280,26 +272,22 @@ def test_landmarks_of_two_faces_are_no_bodies(tmp_path):
         (["3_cam1.png", "12_cam1.png"], [3, 12]),  # the camera's number does not differ
         (["f3_1700000000480.png", "f12_1700000000840.png"], [3, 12]),  # times are no frames
         (["2_0.5_3.JSON", "2_0.5_12.JSON"], [3, 12]),
+        (["a%2012.jpg", "a%2013.jpg"], [12, 13]),  # an escaped space is no digit
         (["a_1.jpg", "b_1.jpg", "c.jpg"], [1, 1]),
         # One frame of several clips, or cameras: the callers refuse equal numbers.
         (["clip1_5.png", "clip2_5.png"], [5, 5]),
-        (["1_5.png", "2_5.png"], [5, 5]),
         (["clip1_5.png", "clip2_9.png"], [5, 9]),
         (["cam1_000012_480.png", "cam1_000013_520.png"], [12, 13]),  # a time [ms]
         (["12_480_7.png", "13_520_7.png"], [12, 13]),
-        (["cam000012.png", "cam000013.png"], [12, 13]),
         # Times of day, and two clips in one folder, number no frames.
         (["T_04_17.73.png", "T_04_17.98.png", "T_04_18.21.png"], [None] * 3),
         (["take1_10.png", "take1_11.png", "take2_5.png"], [None] * 3),
         ([f"T12_04_{s}.png" for s in ("17.738369", "17.771702", "18.005036")], [None] * 3),
-        (["T_17.920.png", "T_17.960.png", "T_18.000.png", "T_18.040.png"], [None] * 4),
         (["take1_3.png", "take1_5.png", "take2_4.png", "take2_2.png"], [None] * 4),
         # One clip whose day, chunk or part falls where its frames count on.
         (["cam_31_12_23_000001", "cam_31_12_23_000002", "cam_01_01_00_000003"], [1, 2, 3]),
         (["3_000001", "3_000002", "2_000003"], [1, 2, 3]),
         (["part_2_frame_0", "part_2_frame_1", "part_1_frame_2"], [0, 1, 2]),
-        (["0004_000100.png", "0004_000101.png"], [100, 101]),
-        (["cam1_frame_12.jpg", "cam1_frame_13.jpg"], [12, 13]),
     ],
 )
 def test_the_frame_is_the_number_that_differs_from_name_to_name(names, wanted):

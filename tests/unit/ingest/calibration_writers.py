@@ -45,7 +45,6 @@ def matrix(one):
 
 
 def project(one, points=POINTS):
-    """Return OpenCV's pixels of world points [m]."""
     turn, _ = cv2.Rodrigues(np.array(one.rotation))
     shift = np.array(one.translation)
     pixels, _ = cv2.projectPoints(points, turn, shift, matrix(one), np.array(one.distortion))
@@ -232,7 +231,6 @@ def write_multical(folder, cameras):
 
 
 def write_plain(folder, cameras, shift="t"):
-    """Write OpenCV's numbers of each camera, as many scripts of researchers do."""
     tables = {
         one.id: {"K": matrix(one).tolist(), "R": one.rotation, shift: one.translation}
         | {"dist": one.distortion, "image_size": SIZE}

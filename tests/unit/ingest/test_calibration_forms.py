@@ -173,6 +173,10 @@ def test_openposes_cameras_take_the_size_of_the_videos(tmp_path):
     assert_same(read_calibration(folder / "b2.xml", sizes), known)
     with pytest.raises(InputError, match="OpenPose's files lack"):
         read_calibration(folder)
+    (tmp_path / "easymocap").mkdir()
+    assert_same(
+        read_calibration(write_easymocap(tmp_path / "easymocap", known, sizes=False), sizes), known
+    )
 
 
 @pytest.mark.parametrize("part", [0.5, 1 / 3, 2 / 3, 1.5])
@@ -355,9 +359,7 @@ def spoil_text(path, old, new):
 BAD_TEXT = {
     "Vicon": [
         (' FOCAL_LENGTH="[^"]*"', "", r"Camera\[0\] a1.FOCAL_LENGTH: expected a number"),
-        ('FOCAL_LENGTH="[^"]*"', 'FOCAL_LENGTH="nan"', "FOCAL_LENGTH: expected finite"),
         ('FOCAL_LENGTH="[^"]*"', 'FOCAL_LENGTH="8.5"', "focal length: expected positive pixels"),
-        (' POSITION="[^"]*"', ' POSITION="1 2"', "POSITION: expected 3 numbers"),
         ('ORIENTATION="[^"]*"', 'ORIENTATION="1 1 0 0"', "a quaternion of length 1, found 1.41"),
         ('PIXEL_ASPECT_RATIO="1"', 'PIXEL_ASPECT_RATIO="1.1"', "expected 1: square pixels"),
         ('SKEW="0"', 'SKEW="2"', "SKEW: expected 0: square pixels"),
@@ -367,21 +369,14 @@ BAD_TEXT = {
         ('0 0 0"', '1e-8 1e-12 9e-18"', r"follow within 0.1 px, found"),
         ("<KeyFrame .*?/>", "", "none: the camera is not calibrated"),
         (r"(<KeyFrame .*?/>)", r"\1\1", "of a camera that does not move, found 2"),
-        ('DEVICEID="b2"', 'DEVICEID="a1"', "a name of its own, found 'a1' a second time"),
-        ('DEVICEID="b2"', 'DEVICEID="b/2"', "name: expected up to 64 letters"),
         ("</Cameras>", "", "expected XML of Qualisys, Vicon or OptiTrack"),
-        ("<Cameras", "<Camera", "mismatched"),
     ],
     "OptiTrack": [
         ("<IntrinsicStandardCameraModel[^>]*>", "", "found Motive's own model alone"),
         ('(CameraModel [^>]*) k3="[^"]*"', r"\1", "k3: expected a number"),
         ("<Extrinsic[^>]*/>", "", "expected <Extrinsic>, found nothing"),
-        (' X="[^"]*"', ' X="inf"', "Extrinsic.X: expected finite numbers"),
         (' X="[^"]*"', ' X="5000"', "positions in metres, found .* Divide"),
         ('OrientMatrix8="[^"]*"', 'OrientMatrix8="0.1"', "rotation: expected a rotation"),
-        ('(CameraModel .*?HorizontalFocalLength)="[^"]*"', r'\1="6"', "focal length: expected"),
-        ("calibrationProfile", "settings", "mismatched"),
-        ('Serial="b2"', 'Serial=""', "name: expected up to 64 letters"),
     ],
     "FreeMoCap": [
         ("= true", "= false", "expected true: .* --lens.* locate-cameras"),
@@ -407,11 +402,8 @@ def test_a_bad_entry_is_refused_with_its_place(tmp_path, form, old, new, message
     [
         ({"rotation": None}, r"pickle: rotation: expected the pose .* found a lens alone"),
         ({"intrinsicMat": None}, r"pickle.intrinsicMat: expected a value"),
-        ({"intrinsicMat": np.eye(2)}, r"intrinsicMat: expected numbers of shape \(3, 3\)"),
         ({"distortion": np.append(np.zeros(11), 0.1)}, "a lens model with more terms"),
-        ({"imageSize": np.array([1080.0])}, r"imageSize: expected numbers of shape \(2,\)"),
         ({"imageSize": np.array([1920.0, 1080.0])}, "found width 1080 and height 1920, which"),
-        ({"rotation": 2.0 * np.array(rig()[0].rotation) @ STANDING}, "rotation: expected a rota"),
         ({"rotation": np.diag([-1.0, 1.0, 1.0])}, "found a mirror image"),
         (
             {
@@ -451,7 +443,6 @@ def test_a_file_in_another_unit_of_length_is_refused(tmp_path, form, factor, mes
         ("intri.yml", "K_a1: ", "K_zz: ", "intri.yml: K_a1: expected a matrix, found nothing"),
         ("intri.yml", "W_a1: .*", "", "Add the width and height .* W_a1: 1920"),
         ("intri.yml", "names:", "cameras:", "names: expected a list of cameras"),
-        ("intri.yml", "data: \\[ 1500.", "data: [ 1e12", "intri.yml: a1.K_a1: expected finite"),
         ("extri.yml", "T_a1: ", "T_zz: ", "extri.yml: T_a1: expected a matrix, found nothing"),
         ("extri.yml", "(T_a1: [^%]*?)rows: 3", r"\1rows: 2", "extri.yml"),
         ("extri.yml", "%YAML", "\x00\x01", "extri.yml: expected"),
@@ -468,10 +459,8 @@ def test_a_bad_easymocap_file_is_refused(tmp_path, file, old, new, message):
     ("text", "message"),
     [
         ("", "expected 32 numbers: .* found 0"),
-        ("1920\n1080\n", "expected 32 numbers: .* found 2"),
         (" ".join(["1"] * 32), "L: expected a last row 0 0 0 1"),
         ("\x00" * 100, "expected 32 numbers, found"),
-        (" ".join(["nan"] * 23 + ["0", "0", "0", "1"] + ["0"] * 5), "K: expected finite numbers"),
     ],
 )
 def test_a_bad_biocv_file_is_refused(tmp_path, text, message):

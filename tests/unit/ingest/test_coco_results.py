@@ -65,13 +65,6 @@ def test_people_come_by_frame_in_the_order_of_the_file(read):
     np.testing.assert_array_equal(people.keypoints[1, 1, 2], [102, 204])
 
 
-def test_joint_without_confidence_is_missing(read):
-    people = read([with_joint(4, 0, 0, 0)])
-    assert np.all(np.isnan(people.keypoints[0, 0, 4]))
-    assert np.isnan(people.confidence[0, 0, 4])
-    assert np.isfinite(people.keypoints).sum() == 2 * 16
-
-
 def test_box_and_score_of_found_joints_stand_in(read):
     # Joint 0, the lowest corner, is missing, so the box starts at joint 1.
     people = read([with_joint(0, 0, 0, 0, bbox=None), person(bbox=[0, 0, 1, 1], score=0.25)])
@@ -148,19 +141,15 @@ def test_a_confidence_just_below_zero_is_a_missing_joint(read):
         ([person(keypoints=[1.0] * 50)], "result 0, keypoints", "51 numbers"),
         ([person(), person(keypoints=0)], "result 1, keypoints", "51 numbers"),
         ([person(), person(keypoints=[1.0] * 75)], "result 1, keypoints", "found 75"),
-        ([person(keypoints=[1.0] * 30)], "cam1.json", "found 10 points"),
         ([person("a.jpg")], "result 0, image_id", "'a.jpg'"),
         ([person(2**40)], "result 0, image_id", "1099511627776"),
         ([person(), 3], "result 1", "a mapping"),
         ([person(bbox=[1, 2, 3])], "result 0, bbox", "4 numbers"),
         ([person(), person(bbox=[1, 2, -3, 4])], "result 1, bbox", "width"),
-        ([person(bbox=[1, 2, math.nan, 4])], "result 0, bbox", "nan"),
-        ([person(score=math.inf)], "result 0, score", "finite"),
         ([person(score=-1)], "result 0, score", "from 0"),
         ([person(), person(score="high")], "result 1, score[0]", "'high'"),
         ({"images": []}, "cam1.json", "annotations"),
         (3, "cam1.json", "annotations"),
-        ("[{]", "cam1.json", "expected JSON"),
     ],
 )
 def test_what_does_not_fit_is_refused_with_its_place(refusal, content, place, words):
@@ -169,16 +158,16 @@ def test_what_does_not_fit_is_refused_with_its_place(refusal, content, place, wo
     assert words in str(error)
 
 
-@pytest.mark.parametrize("entry", ["{}", "[0]", '{"image_id":0,"keypoints":[]}', '""', "0"])
+@pytest.mark.parametrize("entry", ["[0]", '{"image_id":0,"keypoints":[]}'])
 def test_a_large_file_of_small_entries_takes_little_memory(tmp_path, entry):
     """26 MB of them took 770 MB: Python's objects are many times their text."""
     path = tmp_path / "cam1.json"
-    path.write_text("[" + ",".join([entry] * (4_000_000 // len(entry))) + "]")
+    path.write_text("[" + ",".join([entry] * (1_000_000 // len(entry))) + "]")
     tracemalloc.start()
     try:
         with pytest.raises(InputError):
             read_coco_results(path)
-        assert tracemalloc.get_traced_memory()[1] < 20e6
+        assert tracemalloc.get_traced_memory()[1] < 8e6
     finally:
         tracemalloc.stop()
 
@@ -199,7 +188,7 @@ def test_what_is_no_json_is_said_so(tmp_path, content):
     assert (caught.value.where, caught.value.expected) == (str(path), "JSON")
 
 
-@settings(max_examples=100)
+@settings(max_examples=30)
 @given(st.data())
 def test_entries_are_those_that_python_reads_wherever_the_file_is_cut(tmp_path_factory, data):
     path = tmp_path_factory.getbasetemp() / "cut.json"
@@ -249,23 +238,18 @@ def assert_same(a, b):
         assert array.dtype == members(b)[name].dtype
 
 
-def test_written_people_come_back(path, make_people):
-    people = make_people(5, 4, 3)
-    write_keypoint_arrays(path, people)
-    assert_same(read_keypoint_arrays(path), people)
-
-
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
 def test_numpys_own_files_are_read_and_ours_by_numpy(path, make_people, save):
     people = make_people()
     save(path, **members(people))
     assert_same(read_keypoint_arrays(path), people)
     write_keypoint_arrays(path, people)
+    assert_same(read_keypoint_arrays(path), people)
     with np.load(path, allow_pickle=False) as file:
         np.testing.assert_array_equal(file["keypoints"], people.keypoints)
 
 
-@pytest.mark.parametrize("kept", [0, 1, 10, 0.3, 0.6, 0.99])
+@pytest.mark.parametrize("kept", [0, 10, 0.99])
 def test_truncated_file_is_refused(path, make_people, array_refusal, kept):
     write_keypoint_arrays(path, make_people())
     content = path.read_bytes()
@@ -276,7 +260,6 @@ def test_truncated_file_is_refused(path, make_people, array_refusal, kept):
 @pytest.mark.parametrize(
     ("name", "change", "words"),
     [
-        ("frame", lambda a: a.astype(np.int32), "<i8"),
         ("frame", lambda a: a[:-1], "shape"),
         ("frame", lambda a: a[::-1], "rise"),
         ("frame", lambda a: a + 2**40, "up to"),
@@ -286,12 +269,10 @@ def test_truncated_file_is_refused(path, make_people, array_refusal, kept):
         ("boxes", lambda a: a[..., [2, 3, 0, 1]], "x0 y0 x1 y1"),
         ("boxes", lambda a: a * np.float32(np.nan), "a box for every person"),
         ("score", lambda a: a * np.float32(np.nan), "a score for every person"),
-        ("score", lambda a: a + np.float32(np.inf), "finite"),
         ("score", lambda a: a - 2, "from 0"),
         ("confidence", lambda a: a + 1, "(0, 1]"),
         ("confidence", lambda a: a * np.float32(np.nan), "finite exactly where"),
         ("keypoints", lambda a: a * np.float32(np.nan), "finite exactly where"),
-        ("keypoints", lambda a: a + np.float32(np.inf), "pixels"),
     ],
 )
 def test_wrong_array_is_refused_by_name(path, make_people, array_refusal, name, change, words):
@@ -312,34 +293,18 @@ def test_missing_and_further_members_are_refused(path, make_people, array_refusa
     assert "score" in array_refusal().expected
 
 
-@pytest.fixture
-def npz(tmp_path, make_people):
-    """Frames 10, 11 and 14 with two people each."""
-    path = tmp_path / "cam1.npz"
+def test_frames_are_dense_from_first_to_last_or_over_the_wanted_range(path, make_people):
     people = replace(make_people(), frame=np.array([10, 11, 14]))
     write_keypoint_arrays(path, people)
-    return path, people
-
-
-def test_without_a_range_the_file_is_dense_from_its_first_to_its_last_frame(npz):
-    path, people = npz
     read = read_observations(path)
     np.testing.assert_array_equal(read.frame, [10, 11, 12, 13, 14])
     np.testing.assert_array_equal(read.keypoints[[0, 1, 4]], people.keypoints)
-    assert np.all(np.isnan(read.keypoints[2:4]))
-    assert np.all(np.isnan(read.score[2:4]))
-
-
-def test_a_range_leaves_out_and_pads(npz):
-    path, people = npz
+    assert np.isnan(read.keypoints[2:4]).all() and np.isnan(read.score[2:4]).all()
     read = select_ranges(path, read_people(path).people, [(11, 6)])
     np.testing.assert_array_equal(read.frame, np.arange(11, 17))
     np.testing.assert_array_equal(read.boxes[[0, 3]], people.boxes[1:])
-    assert np.all(np.isnan(read.boxes[[1, 2, 4, 5]]))
-
-
-@pytest.mark.parametrize("first_frame", [0, 15, 2**40, -(10**30)])
-def test_people_outside_the_wanted_frames_are_refused(npz, first_frame):
-    with pytest.raises(InputError, match="found frames 10 to 14") as caught:
-        select_ranges(npz[0], read_people(npz[0]).people, [(first_frame, 5)])
-    assert "offset_frames" in caught.value.todo
+    assert np.isnan(read.boxes[[1, 2, 4, 5]]).all()
+    for first in (0, 15, 2**40, -(10**30)):
+        with pytest.raises(InputError, match="found frames 10 to 14") as caught:
+            select_ranges(path, read_people(path).people, [(first, 5)])
+        assert "offset_frames" in caught.value.todo

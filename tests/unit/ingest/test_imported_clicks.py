@@ -340,7 +340,6 @@ def test_places_depend_on_the_pitch_of_the_venue_and_names_do_not(tmp_path):
     [
         ({"clicks": [("corner_left_nera", (1.0, 2.0))]}, None, "corner_left_near"),
         ({"clicks": [("(900,2)", (1.0, 2.0))]}, None, "four places"),
-        ({"clicks": [("(1,2)", (1.0, 2.0))]}, None, "four places"),
         ({"lines": [("touch_line", LINE)]}, None, "touch_line_"),
         ({"size": (960, 540)}, None, "960 x 540"),
         ({"name": "north.png"}, None, "east, west"),

@@ -11,7 +11,6 @@ from run_records import match_spec
 from data_contracts.match import MatchSpec
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
-from worldpose.formats.keypoint_files import read_observations
 from worldpose.ingest.footage import UnitFrames, read_unit, unit_frames
 from worldpose.ingest.match_folder import read_match, require_calibrated, unclicked_clips
 from worldpose.ingest.validation import validate_record
@@ -20,7 +19,6 @@ from worldpose.ingest.writing import write_match, write_offsets
 
 @pytest.fixture
 def edit(match_folder):
-    """Change match.yaml: `edit(lambda content: ...)`."""
 
     def change(function):
         path = match_folder / "match.yaml"
@@ -200,35 +198,20 @@ def test_the_side_of_a_static_camera_lets_key_frames_be_proposed(match_folder, e
     assert match.proposed_views == match.calibrated_views == ("goal",)
 
 
-def test_units_lie_on_the_matchs_clock(spec):
+def test_units_lie_on_the_matchs_clock(match_folder, spec, make_people):
     # Clips span 5 to 8 and 9 to 11; cam2 runs 10 frames ahead; goal's own video starts at 0.
     clips = ((5, 3), (9, 2))
-    assert unit_frames(spec, "cam1") == UnitFrames(first=5, count=6, offset=0, ranges=clips)
     assert unit_frames(spec, "cam2") == UnitFrames(first=5, count=6, offset=10, ranges=clips)
     assert unit_frames(spec, "goal") == UnitFrames(first=5, count=3, offset=-5, ranges=((5, 3),))
-
-
-def test_a_static_camera_covers_all_clips_in_match_frames(match_folder, make_people):
     people, calibration = read_unit(read_match(match_folder), "cam1")
     np.testing.assert_array_equal(people.frame, [5, 6, 7, 9, 10])
     there = [0, 1, 2, 4, 5]  # nothing is kept of frame 8, which no clip has
     np.testing.assert_array_equal(people.keypoints, make_people(5, 6, seed=1).keypoints[there])
-    assert calibration is not None
     assert calibration.id == "cam1"
-
-
-def test_a_broadcast_camera_covers_its_clip(match_folder, make_people):
-    # Clip goal starts at match frame 5; its video starts at frame 0.
     people, calibration = read_unit(read_match(match_folder), "goal")
     np.testing.assert_array_equal(people.frame, [5, 6, 7])
     np.testing.assert_array_equal(people.keypoints, make_people(0, 3, seed=3).keypoints)
     assert calibration is None
-
-
-@pytest.mark.parametrize("unit_id", ["cam9", "main", "corner"])
-def test_a_unit_without_detections_is_refused(match_folder, unit_id):
-    with pytest.raises(InputError, match="those of cam1, cam2, goal"):
-        read_unit(read_match(match_folder), unit_id)
 
 
 @pytest.fixture
@@ -244,30 +227,11 @@ def files(folder):
     }
 
 
-def test_a_written_match_is_read_as_it_was(tmp_path, one, make_people, make_camera):
-    people = make_people()
-    write_match(
-        tmp_path / "m",
-        one,
-        calibrations={"cam1": make_camera()},
-        observations={"cam1": people},
-        pitch=PitchSpec(length=104.2),
-    )
-    match = read_match(tmp_path / "m")
-    assert match.spec == one
+def test_a_written_match_keeps_its_pitch_and_has_usual_rights(write_tiny, tmp_path):
+    folder = write_tiny(pitch=PitchSpec(length=104.2))
+    assert read_match(folder).pitch == PitchSpec(length=104.2)
     (tmp_path / "usual").mkdir()
-    assert (tmp_path / "m").stat().st_mode == (tmp_path / "usual").stat().st_mode
-    assert match.pitch == PitchSpec(length=104.2)
-    back = read_observations(match.detections["cam1"])
-    assert {name: array.tobytes() for name, array in back.arrays().items()} == {
-        name: array.tobytes() for name, array in people.arrays().items()
-    }
-    assert sorted(files(tmp_path / "m")) == [
-        "calibration.toml",
-        "detections/cam1.npz",
-        "match.yaml",
-        "pitch.json",
-    ]
+    assert folder.stat().st_mode == (tmp_path / "usual").stat().st_mode
 
 
 @pytest.mark.parametrize("kind", ["folder", "file", "link"])
@@ -296,17 +260,6 @@ def test_a_failure_on_the_way_leaves_nothing(tmp_path, one, make_people):
             tmp_path / "m", one, calibrations={}, observations={"cam1": make_people()}, further=fail
         )
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("name", ["cam9", "../cam1"])
-def test_data_of_unknown_cameras_are_refused(tmp_path, one, make_people, make_camera, name):
-    people = {"cam1": make_people()}
-    with pytest.raises(InputError, match="data of its cameras and clips: cam1, clip"):
-        write_match(
-            tmp_path / "m", one, calibrations={}, observations={**people, name: people["cam1"]}
-        )
-    with pytest.raises(InputError, match="data of its cameras and clips: cam1, clip"):
-        write_match(tmp_path / "m", one, calibrations={name: make_camera()}, observations=people)
 
 
 def test_clock_offsets_are_written_into_match_yaml_and_all_else_stays(tmp_path):
@@ -358,11 +311,6 @@ def record_refusal(data, model=MatchSpec):
     return caught.value
 
 
-def test_plain_data_becomes_the_record():
-    spec = validate_record(MatchSpec, match(), "match.yaml")
-    assert (spec.fps, spec.cameras[1].id, spec.clips[0].frame_count) == (25.0, "cam2", 10)
-
-
 FIRST = "match.yaml: cameras[0]"
 
 
@@ -371,31 +319,16 @@ FIRST = "match.yaml: cameras[0]"
     [
         (match(fps=...), "match.yaml: fps", "a value", "nothing", "Add"),
         (match(fps=-1), "match.yaml: fps", "greater than or equal to 1", "-1", "Correct"),
-        (match(fps="25"), "match.yaml: fps", "a valid number", "'25'", "Correct"),
         (match(fps=math.nan), "match.yaml: fps", "a finite number", "nan", "Correct"),
         (match(match_id=12), "match.yaml: match_id", "a valid string", "12", "quotes: '12'"),
         (match(match_id=False), "match.yaml: match_id", "a valid string", "no, off", "'no'"),
         (match(match_id="../x"), "match.yaml: match_id", "letters", "'../x'", "Rename"),
-        (match(match_id="a" * 65), "match.yaml: match_id", "64", "aaa...", "Rename"),
         (match(contract=2), "match.yaml: contract", "1", "2", "version of worldpose"),
-        (match(cameras={"a": 1}), "match.yaml: cameras", "a valid array", "a mapping", "Correct"),
         (match(cameras=[camera(kind="fixed")]), f"{FIRST}.kind", "'broadcast'", "'fixed'", ""),
         (match(cameras=[camera(id=None)]), f"{FIRST}.id", "a valid string", "nothing", "Correct"),
-        (
-            match(cameras=[camera(), camera(widht=1)]),
-            "match.yaml: cameras[1].widht",
-            "width",
-            "'widht'",
-            "'width'?",
-        ),
+        (match(cameras=[camera(widht=1)]), f"{FIRST}.widht", "width", "'widht'", "'width'?"),
         (match(extra=1), "match.yaml: extra", "match_id", "'extra'", "Remove it"),
-        (
-            match(cameras=[camera(), camera()]),
-            "match.yaml",
-            "agree",
-            "used twice: ['cam2']",
-            "named",
-        ),
+        (match(cameras=[camera()] * 2), "match.yaml", "agree", "used twice: ['cam2']", "named"),
         (match(cameras=[]), "match.yaml: cameras", "at least 1", "0", "Correct"),
         ([1], "match.yaml", "a mapping", "[1]", "Correct"),
     ],

@@ -85,18 +85,6 @@ def film(trial, size, bars=(0, 0)):
         write_video(trial / "videos" / f"{name}.mp4", [frame] * 14, 60.0)
 
 
-def test_a_resized_video_scales_the_calibration(trial, tmp_path):
-    film(trial, (544, 960))
-    _, notes = import_pose2sim(trial, tmp_path / "m")
-    found = read_calibration(tmp_path / "m" / "calibration.toml")["cam02"]
-    assert (found.image_size, found.focal_px) == ((544, 960), (750.0, 750.0))
-    # The image's corner, at -0.5, is that of the resized image.
-    assert found.principal_point_px == (540.5 / 2 - 0.5, 960.5 / 2 - 0.5)
-    assert "cam02.mp4: 544 x 960 px, calibrated are 1088 x 1920: the calibration is scaled" in str(
-        notes
-    )
-
-
 def test_a_calibrated_camera_without_a_video_is_named_with_the_folder_of_videos(trial, tmp_path):
     film(trial, (1088, 1920))
     cameras = {name: camera(name, x) for x, name in enumerate((*CAMERAS, "cam03"))}
@@ -252,15 +240,12 @@ SPOILT = [
         lambda folder: [file.unlink() for file in folder.iterdir()],
         r"cam01_json: expected a .json file for each frame, found none",
     ),
-    (FRAME, "{", r"cam01_000010.json: expected JSON"),
     (
         FRAME,
         '{"persons": []}',
         r"cam01_000010.json: people: expected a list of at most 1000 people",
     ),
     (FRAME, people_of(1, 2, 0.5), r"keypoints_2d: expected x, y.*26 \(HALPE-26\).*fo"),
-    (FRAME, people_of(*["x"] * 78), r"people\[0\].pose_keypoints_2d\[0\]: .* found 'x'"),
-    (FRAME, people_of(*[np.inf] * 78), r"keypoints_2d: expected pixels up to .*found inf"),
     (
         POSES,
         lambda folder: write_frame(folder, 11, [person(25, 0)[0]]),
@@ -271,11 +256,6 @@ SPOILT = [
         lambda file: file.rename(file.with_name("first.json")),
         r"first.json: expected a frame number .* Name it as cam01_000012.json",
     ),
-    (
-        FRAME,
-        lambda file: shutil.copy(file, file.with_name("again_10.json")),
-        r"expected one file per frame, found again_10.json with the same",
-    ),
     (CONFIG, "[project]\nframe_rate = 'fast'\n", r"frame_rate: expected .* or 'auto', found"),
     (CONFIG, None, r"Config.toml: project.frame_rate: expected frames per second, as there are n"),
     (
@@ -283,7 +263,6 @@ SPOILT = [
         "[project]\nframe_rate = 60\nframe_range = [30, 10]\n",
         r"Config.toml: project.frame_range: expected .* found \[30, 10\]",
     ),
-    (CONFIG, "[project\n", r"Config.toml: expected TOML"),
     (CONFIG, "project = [1]\n", r"Config.toml: project: expected a table, found \[1\]"),
     (
         "pose",

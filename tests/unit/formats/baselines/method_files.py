@@ -62,7 +62,6 @@ def truth_of(bodies):
 
 
 def wobbled(bodies):
-    """The same bodies, too high and too low by turns."""
     transl = bodies.transl + PATTERN[:, None] * [0.0, 0.0, 1.0]
     return BodyParameters(bodies.betas, bodies.global_orient, bodies.body_pose, transl)
 
@@ -87,7 +86,6 @@ def in_camera(bodies, camera):
 
 
 def y_up(bodies, seed=5):
-    """Bodies in a method's own world: y up, turned and shifted."""
     turn = Rotation.from_rotvec([0.0, 0.1 * seed, 0.0]) * Rotation.from_rotvec([-np.pi / 2, 0, 0])
     return moved(bodies, turn, np.array([3.0, 0.5, seed]))
 
