@@ -29,7 +29,7 @@ from flows.web.history import _find_cause
 from worldpose.errors import InputError
 from worldpose.review.journal import say
 from worldpose.store.store import open_run
-from worldpose.video.files import VideoReader
+from worldpose.video import VideoReader
 
 
 def test_runs_are_listed_compared_and_kept_by_name(ada, store, monkeypatch):
