@@ -114,7 +114,7 @@ def _cameras(boards: Path, camera: str | None) -> dict[str, Path]:
 
 def _camera_name(place: Path) -> str:
     """Return a camera's id by its folder or video; `int_cam01_img`, as in Pose2Sim, is cam01."""
-    name = place.stem if place.is_file() else place.absolute().name
+    name = place.stem if place.is_file() else place.resolve().name
     return camera_id(name.removeprefix("int_").removesuffix("_img"))
 
 

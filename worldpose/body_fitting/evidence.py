@@ -96,7 +96,7 @@ class PersonEvidence:
     ) -> PersonEvidence:
         """Return the evidence with points besides COCO-17 after it; arguments as of `of`.
 
-        Joints are (frames, points, 3) [m], NaN where missing.
+        Joints are (frames, points, 3) [m], NaN where missing, covariance (frames, points, 3, 3).
         """
         own = self.of(joints, covariance, fps, settings)
         return PersonEvidence(

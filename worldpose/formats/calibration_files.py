@@ -177,8 +177,11 @@ def read_calibration_toml(
     tables = list(camera_tables(path, content))
     posed = [each for each in tables if not _lacks_pose(each[2])]
     if left_out is not None and posed:
-        lacking = [name for _, name, table in tables if _lacks_pose(table)]
-        left_out.update({camera_id(name): "it has no pose" for name in lacking})
+        for _, name, table in tables:
+            if _lacks_pose(table):
+                half = [key for key in ("rotation", "translation") if not table.get(key)]
+                what = half[0] if len(half) == 1 else "pose"
+                left_out[camera_id(name)] = f"it has no {what}"
         tables = posed
     cameras = []
     for where, name, given in tables:

@@ -56,10 +56,11 @@ def to_camera_axes(
 def view(
     camera: CameraNumbers, x: float, y: float, z: float
 ) -> tuple[int, float, float, float, float, float, float, float, float]:
-    """Return RayStatus, u and v [px] of a point in camera axes, and derivatives of u, then of v.
+    """Return the pixel of a point in camera axes, and its derivatives.
 
-    They are by x, y and z [px/m]. Pixel and derivatives are the formula's also where the status is
-    not OK.
+    Returns:
+        RayStatus; u and v [px]; the derivatives of u, then of v, by x, y and z [px/m]. Pixel and
+        derivatives are the formula's also where the status is not OK.
     """
     a, b = x / z, y / z
     xd, yd, dxx, dxy, dyy = distort(camera, a, b)
@@ -85,7 +86,10 @@ def view(
 
 @inline_kernel
 def by_world(camera: CameraNumbers, gx: float, gy: float, gz: float) -> tuple[float, float, float]:
-    """Return derivatives by a world point from those in camera axes; by the center, minus these."""
+    """Return derivatives by a world point from those by the point in camera axes.
+
+    The derivatives by the camera's center are their negatives.
+    """
     wx = gx * camera.r00 + gy * camera.r10 + gz * camera.r20
     wy = gx * camera.r01 + gy * camera.r11 + gz * camera.r21
     wz = gx * camera.r02 + gy * camera.r12 + gz * camera.r22
@@ -104,10 +108,15 @@ def by_rotation(
 def observe(
     camera: CameraNumbers, px: float, py: float, pz: float, by_step: Floats, by_point: Floats
 ) -> tuple[int, float, float, float]:
-    """Return status, pixel u, v [px] and depth [m] of a world point [m], and write derivatives.
+    """Return status, pixel u, v [px] and depth [m] of a world point, and write derivatives.
 
-    `by_step` (2, STEP) are by a step of a camera with square pixels, `by_point` (2, 3) by the
-    point.
+    Args:
+        camera: numbers of the camera.
+        px: x of the point [m], world.
+        py: y.
+        pz: z.
+        by_step: (2, STEP) derivatives by a step of a camera with square pixels, written.
+        by_point: (2, 3) derivatives by the point, written.
     """
     x, y, z = to_camera_axes(camera, px, py, pz)
     status, u, v, gx, gy, gz, hx, hy, hz = view(camera, x, y, z)
@@ -169,7 +178,13 @@ def step_row(c: Floats, step: Floats, out: Floats) -> None:
 
 @compile_kernel
 def project(cameras: Floats, points: Floats, image: Floats) -> None:
-    """Write pixels (batch, n, 2) of world points (batch, n, 3) [m], NaN where there is no image."""
+    """Write pixels of world points; NaN where a point has no image.
+
+    Args:
+        cameras: (batch, WIDTH).
+        points: (batch, n, 3) [m], world.
+        image: (batch, n, 2) [px], written.
+    """
     for row in range(points.shape[0]):
         camera = load_camera(cameras, row)
         for i in range(points.shape[1]):
@@ -186,9 +201,13 @@ def project_with_jacobians(
 ) -> None:
     """Write pixels of world points and all derivatives; NaN where a point has no image.
 
-    Points are (batch, n, 3) [m], pixels (batch, n, 2) with a RayStatus (batch, n). The Jacobian
-    (batch, n, 2, DERIVATIVES) is by the world point, by the left tangent update (rotation,
-    translation), by fx fy cx cy, by k1 k2 p1 p2 k3 k4 k5 k6.
+    Args:
+        cameras: (batch, WIDTH).
+        points: (batch, n, 3) [m], world.
+        image: (batch, n, 2) [px], written.
+        jacobian: (batch, n, 2, DERIVATIVES), written: by the world point, by the left
+            tangent update (rotation, translation), by fx fy cx cy, by k1 k2 p1 p2 k3 k4 k5 k6.
+        status: (batch, n) RayStatus, written.
     """
     for row in range(points.shape[0]):
         finite, camera = is_finite(cameras, row), load_camera(cameras, row)
@@ -226,8 +245,13 @@ def project_with_jacobians(
 def normalize(cameras: Floats, image: Floats, plane: Floats, status: Image) -> None:
     """Write points (x, y) on the plane z = 1 whose images are given; NaN where there are none.
 
-    The first half of Pi^-1: distort(x, y) = ((u - cx) / fx, (v - cy) / fy). Image and plane are
-    (batch, n, 2), with a RayStatus (batch, n).
+    The first half of Pi^-1: distort(x, y) = ((u - cx) / fx, (v - cy) / fy).
+
+    Args:
+        cameras: (batch, WIDTH).
+        image: (batch, n, 2) [px].
+        plane: (batch, n, 2), written.
+        status: (batch, n) RayStatus, written.
     """
     for row in range(image.shape[0]):
         finite, camera = is_finite(cameras, row), load_camera(cameras, row)
@@ -246,8 +270,12 @@ def normalize(cameras: Floats, image: Floats, plane: Floats, status: Image) -> N
 def point_rays(cameras: Floats, plane: Floats, directions: Floats) -> None:
     """Write unit directions in the world frame through points on the plane z = 1.
 
-    The second half of Pi^-1, after `normalize`: d = R^T (x, y, 1) / |(x, y, 1)|. The plane is
-    (batch, n, 2), directions are (batch, n, 3).
+    The second half of Pi^-1, after `normalize`: d = R^T (x, y, 1) / |(x, y, 1)|.
+
+    Args:
+        cameras: (batch, WIDTH).
+        plane: (batch, n, 2).
+        directions: (batch, n, 3), written.
     """
     for row in range(plane.shape[0]):
         camera = load_camera(cameras, row)

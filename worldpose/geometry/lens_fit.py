@@ -30,7 +30,13 @@ INTRINSICS: Final = _PARAMETERS[:4]
 
 @dataclass(frozen=True, eq=False)
 class FittedLens:
-    """A lens at the origin fitted to places (n, 2) on the plane z = 1 and their pixels (n, 2)."""
+    """A lens fitted to places and their pixels.
+
+    Attributes:
+        camera: a single camera at the origin.
+        plane: (n, 2) places on the plane z = 1.
+        pixels: (n, 2) [px].
+    """
 
     camera: Camera
     plane: Floats
@@ -77,8 +83,12 @@ def fit_lens(
 ) -> FittedLens:
     """Return the lens of a model that images places (n, 2) on the plane z = 1 at pixels (n, 2).
 
-    The single camera `lens` has focal length and principal point to start from; places are finite.
-    The free parameters are of `INTRINSICS` and `DISTORTION`; coefficients that are not free are 0.
+    Args:
+        lens: a single camera, whose focal length and principal point are a start.
+        plane: finite places.
+        pixels: their pixels [px].
+        model: lens model; coefficients that are not free are 0.
+        free: names of the free parameters, of `INTRINSICS` and `DISTORTION`.
     """
     start = replace(lens, distortion=np.zeros(8), lens_model=model, cam_from_world=Rigid.identity())
     chosen = [_PARAMETERS.index(name) for name in free]
@@ -116,9 +126,12 @@ def fit_brown_lens(
     polynomial follows a fisheye, and places there would spoil the middle: if a fit to the whole
     image has gross errors, it is to the widest cone about the axis in which errors are small.
 
-    The errors are `max_error_px` within `fitted_angle_deg` of the axis, and `max_error_beyond_px`
-    over the rest of the image; None where Brown's lens folds there. InputError if errors are small
-    in less than half of the image.
+    Returns:
+        The camera, and `max_error_px` within `fitted_angle_deg` of the axis, and
+        `max_error_beyond_px` over the rest of the image; None where Brown's lens folds there.
+
+    Raises:
+        InputError: errors are small in less than half of the image.
     """
     # Small and gross errors [px]: 2.2 and 11 px of Full HD.
     most_px, gross_px = (share * float(np.hypot(*camera.image_size)) for share in (0.001, 0.005))

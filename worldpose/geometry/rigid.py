@@ -172,10 +172,14 @@ class Rigid:
 
 
 def nearest_rotation(where: str, matrix: ArrayLike) -> Floats:
-    """Return the exact rotation nearest to a matrix (3, 3), R of x_b = R x_a + t.
+    """Return the exact rotation nearest to a matrix given with at least six decimals.
 
-    InputError, with file and position `where`, if it is not orthonormal with determinant 1 within
-    six decimals.
+    Args:
+        where: file and position of the matrix, for the message.
+        matrix: (3, 3), R of x_b = R x_a + t.
+
+    Raises:
+        InputError: the matrix is not orthonormal with determinant 1 within six decimals.
     """
     rotation = check_shape(where, matrix, (3, 3))
     excess = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
@@ -202,7 +206,11 @@ def index_leading(index: Index, trailing: int) -> tuple[Any, ...]:
 
 
 def check_shape(where: str, array: ArrayLike, trailing: tuple[int, ...]) -> Floats:
-    """Return `array` as float64, with these last dimensions or InputError; -1 = any length."""
+    """Return `array` as float64 after a check of its last dimensions; -1 stands for any length.
+
+    Raises:
+        InputError: the last dimensions differ from `trailing`.
+    """
     values = np.asarray(array, dtype=np.float64)
     last = values.shape[values.ndim - len(trailing) :] if values.ndim >= len(trailing) else None
     if last is None or any(want not in (-1, got) for want, got in zip(trailing, last, strict=True)):
@@ -217,7 +225,11 @@ def check_shape(where: str, array: ArrayLike, trailing: tuple[int, ...]) -> Floa
 
 
 def common_batch(where: str, *batches: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the shape that all batch shapes broadcast to; InputError if there is none."""
+    """Return the shape that all batch shapes broadcast to.
+
+    Raises:
+        InputError: the shapes do not broadcast.
+    """
     try:
         return functools.reduce(np.broadcast_shapes, batches)
     except ValueError:
@@ -250,9 +262,11 @@ class Similarity:
     """(..., 3) [m]"""
 
     def apply(self, points: ArrayLike) -> Floats:
-        """Return points (..., n, 3) [m] of frame a in frame b.
+        """Return points in frame b.
 
-        The batch broadcasts against the dimensions before n.
+        Args:
+            points: (..., n, 3) [m] in frame a; the batch broadcasts against the dimensions
+                before n.
         """
         source = check_shape("Similarity.apply: points", points, (-1, 3))
         scaled = self.scale[..., None, None] * np.swapaxes(self.rotation, -1, -2)
@@ -278,9 +292,17 @@ def align(
     collinear points leave the rotation about their line open, and coinciding points give a
     translation (identity, scale 1). Without a common point the motion is NaN.
 
-    Sets are (..., n, 3) [m], NaN where missing, else InputError; weights (..., n) are of pairs.
-    With scale it is a similarity (Procrustes analysis), else a rigid motion (Umeyama, IEEE PAMI
-    13(4), 1991).
+    Args:
+        source: (..., n, 3) [m]; NaN where missing.
+        target: (..., n, 3) [m]; NaN where missing.
+        with_scale: a similarity (Procrustes analysis) if true, a rigid motion if not.
+        weights: (..., n) weight of each pair.
+
+    Raises:
+        InputError: the last dimensions are not (n, 3).
+
+    Note:
+        Umeyama, IEEE PAMI 13(4), 1991.
     """
     a, b = np.broadcast_arrays(
         check_shape("align: source", source, (-1, 3)), check_shape("align: target", target, (-1, 3))

@@ -106,7 +106,8 @@ def as_cameras(
     """Return a folder's files by their cameras (`known_id`); InputError for two of one camera."""
     named: dict[str, Path] = {}
     for name, file in found.items():
-        if (camera := known_id(name, cameras)) in named:
+        whole = file.stem if file.is_file() else file.name.removesuffix("_json")
+        if (camera := known_id(whole if whole in cameras else name, cameras)) in named:
             two = f"{named[camera].name} and {file.name}"
             raise InputError(str(folder), f"one file of {camera}", two, "Keep one of them.")
         named[camera] = file

@@ -56,7 +56,7 @@ def follow_changes(
     One camera is corrected at a time: it spoils the people that the others meet. `open_detections`
     returns the clip with some changes of views taken back.
     """
-    detections, changes = open_detections(()), list[CameraChange]()
+    detections, changes, is_false = open_detections(()), list[CameraChange](), False
     frame = np.asarray(detections.frame, dtype=np.int64)
     while True:
         tracks = track(detections)
@@ -74,10 +74,12 @@ def follow_changes(
             changes[-1] = after
             # The few people of a short rest of the clip may meet others anywhere.
             is_vague = after.std is not None and shift < 3.0 * after.std
-            if is_gone or is_vague or is_by_chance(after):
-                detections = open_detections(changes[:-1])
-                return FollowedClip(detections, track(detections), tuple(changes[:-1]))
+            is_false = is_gone or is_vague or is_by_chance(after)
+            if is_false:
+                changes.pop()
             detections = open_detections(changes)
+            if is_false:
+                tracks = track(detections)
         lost = find_lost_views(cameras, detections, tracks.joints, fps)
         found = [change_record(each, names[each.camera], frame) for each in lost]
         views = [
@@ -85,7 +87,7 @@ def follow_changes(
             for each in found
             if each.kind == "view" and not any(is_same_change(one, each, fps) for one in changes)
         ]
-        if not views or len(changes) >= 2 * len(names):
+        if is_false or not views or len(changes) >= 2 * len(names):
             lost = [each for each in lost if each.kind == "clock"]
             clocks = _trace_clocks(cameras, fps, detections, tracks, track, lost)
             told = [change_record(each, names[each.camera], frame) for each in clocks]
@@ -107,7 +109,7 @@ def _trace_clocks(
     `lost` are those that keep people from meeting. Other arguments are as of `follow_changes`.
     """
     count = len(cameras.focal)
-    index: NDArray[np.integer] = tracks.detection_index
+    index: NDArray[np.integer] = (first := tracks.detection_index)
     if count < 3 or not index.shape[2]:
         return []
     rows, clocks = np.arange(len(index)), list(lost)
@@ -117,7 +119,8 @@ def _trace_clocks(
         for part in parts:
             late[part.camera] += part.size[0] * part.share(rows, len(rows))
         if np.abs(late - taken_back).max() > 1.0:
-            index, taken_back = _track_in_time(detections, np.rint(late).astype(int), track), late
+            moved, taken_back = np.rint(late).astype(int), late
+            index = _track_in_time(detections, moved, track) if moved.any() else first
         elif attempt:
             break
         people = detections.assign_people(index)
@@ -126,7 +129,16 @@ def _trace_clocks(
         sums = sum_clip(cameras, people, fps, rows, known, settings)
         found = find_changes(cameras, people, fps, rows, sums, start=parts)
         clocks = [_keep_row(each, clocks, fps) for each in found if each.kind == "clock"]
-    return clocks
+    # Near an end of the clip, the rows that a step leaves open are all that tell of it.
+    short = [each for each in lost if each.row is not None and _rest(each, len(rows), fps) < fps]
+    told = {each.camera for each in clocks}
+    return [*clocks, *(each for each in short if each.camera not in told)]
+
+
+def _rest(step: MeasuredChange, frames: int, fps: float) -> float:
+    """Return how many rows before or after a step tell of it, where these are fewer."""
+    assert step.row is not None
+    return min(step.row, frames - step.row) - 0.2 * fps - max(0.0, float(step.amount[4]))
 
 
 def _keep_row(step: MeasuredChange, known: Sequence[MeasuredChange], fps: float) -> MeasuredChange:
@@ -216,13 +228,14 @@ def add_changes(
     back. `frame` (frames,) are the clip's match frames, `fps` of them a second [1/s].
     """
     stay, new = list(known), list[CameraChange]()
+    measured_clocks = {(names.index(one.camera), one.kind) for one in known}
     for each in measured:
         change = change_record(each, names[each.camera], frame)
         if is_by_chance(change):  # told, not taken back
             change = change.model_copy(update={"is_explained": False})
         same = [one for one in stay if is_same_change(one, change, fps)]
-        if change.kind == "clock" and any(one.kind == "clock" for one in known):
-            continue  # those were measured together, on people who were tracked by right clocks
+        if change.kind == "clock" and (each.camera, "clock") in measured_clocks:
+            continue  # it was measured on people who were tracked by right clocks
         if not same:
             new.append(change)
         elif change.frame is None:  # the tracker measured the drift on the people that it had left

@@ -120,7 +120,7 @@ def test_half_a_pose_is_none(tmp_path):
     half = CALISCOPE.replace("cameras.3", "cameras.4").replace("[[0.1], [0.2], [3.0]]", "[]")
     (tmp_path / "c.toml").write_text(CALISCOPE + half)
     assert [*read_calibration(tmp_path / "c.toml", left_out=(left_out := LeftOut()))] == ["cam_3"]
-    assert left_out == {"cam_4": "it has no pose"}
+    assert left_out == {"cam_4": "it has no translation"}
 
 
 @pytest.mark.parametrize(

@@ -17,10 +17,11 @@ FPS, FRAMES, BAD = 25.0, 200, 3
     [
         (lambda t: t + 12 * (t >= 90), 12.0),
         (lambda t: t - 9 * (t >= 120), -9.0),
+        (lambda t: t + 20 * (t >= 22), 20.0),
         (lambda t: t + np.rint(6 * t / (FRAMES - 1)).astype(int), 6.0),
         (lambda t: t, None),
     ],
-    ids=["lost frames", "repeated frames", "fast", "healthy"],
+    ids=["lost frames", "repeated frames", "near the beginning", "fast", "healthy"],
 )
 def test_a_clock_is_measured_on_people_who_are_tracked_with_it_taken_back(
     ring, people, seen, times, late
@@ -39,4 +40,6 @@ def test_a_clock_is_measured_on_people_who_are_tracked_with_it_taken_back(
     found = [(each.camera, each.kind) for each in clip.changes]
     assert found == [("abcde"[BAD], "clock")] * (late is not None)
     if found:
-        assert clip.changes[0].late_frames == pytest.approx(late, abs=0.2)
+        assert clip.changes[0].late_frames == pytest.approx(
+            late, abs=0.2 if times(22) < 40 else 2.0
+        )

@@ -79,9 +79,11 @@ def test_what_the_people_show_again_of_a_lost_view_decides(monkeypatch, refined,
 
 def test_clocks_that_were_measured_while_people_were_tracked_are_told_once():
     told = KNOCK.model_copy(update={"kind": "clock", "shift_px": (0.0, 0.0), "late_frames": 6.0})
-    again = MeasuredChange(0, "clock", 35, np.array([0.0, 0.0, 0.0, 0.0, 2.0]))
+    again, other = (
+        MeasuredChange(camera, "clock", 35, np.array([0.0, 0.0, 0.0, 0.0, 2.0]))
+        for camera in (1, 0)
+    )
     frame, names = np.arange(FIRST, FIRST + 41), ("a", "b", "c")
-    stay, new = change_search.add_changes([told], [again, LOST], names, None, frame, 10.0)
-    assert (stay, [each.kind for each in new]) == ([told], ["view"])
-    stay, new = change_search.add_changes([], [again], names, None, frame, 10.0)
-    assert (stay, [each.late_frames for each in new]) == ([], [2.0])
+    stay, new = change_search.add_changes([told], [again, other, LOST], names, None, frame, 10.0)
+    assert stay == [told]
+    assert [(each.camera, each.kind) for each in new] == [("a", "clock"), ("b", "view")]
