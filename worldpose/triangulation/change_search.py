@@ -129,16 +129,15 @@ def _trace_clocks(
         sums = sum_clip(cameras, people, fps, rows, known, settings)
         found = find_changes(cameras, people, fps, rows, sums, start=parts)
         clocks = [_keep_row(each, clocks, fps) for each in found if each.kind == "clock"]
-    # Near an end of the clip, the rows that a step leaves open are all that tell of it.
-    short = [each for each in lost if each.row is not None and _rest(each, len(rows), fps) < fps]
     told = {each.camera for each in clocks}
-    return [*clocks, *(each for each in short if each.camera not in told)]
+    at_ends = [each for each in lost if _is_at_an_end(each, len(rows), fps)]
+    return [*clocks, *(each for each in at_ends if each.camera not in told)]
 
 
-def _rest(step: MeasuredChange, frames: int, fps: float) -> float:
-    """Return how many rows before or after a step tell of it, where these are fewer."""
-    assert step.row is not None
-    return min(step.row, frames - step.row) - 0.2 * fps - max(0.0, float(step.amount[4]))
+def _is_at_an_end(step: MeasuredChange, frames: int, fps: float) -> bool:
+    """Return whether all rows before or after a step, two bins or more, may be its lost frames."""
+    row, lost = step.row or 0, max(0.0, float(step.amount[4]))
+    return 0.4 * fps <= min(row, frames - row) < 0.4 * fps + lost
 
 
 def _keep_row(step: MeasuredChange, known: Sequence[MeasuredChange], fps: float) -> MeasuredChange:
