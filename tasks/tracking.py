@@ -205,25 +205,13 @@ def _describe_changes(
     """Return sentences about cameras that change, and others whose people meet nobody any more."""
     lone = find_lone_views(clip.cameras, clip.detections, tracks.joints, clip.fps)
     explained = {change.camera for change in changes}
-    return [_describe_tracked(change) for change in changes] + [
+    return [f"{describe_change(change)}." for change in changes] + [
         f"camera {clip.camera_ids[c]}: from frame {clip.detections.frame[row]} on most of its "
         "people meet nobody, though other cameras place people in its view. Look whether it moved, "
         "or its clock changed."
         for c, row in lone.items()
         if clip.camera_ids[c] not in explained
     ]
-
-
-def _describe_tracked(change: CameraChange) -> str:
-    """Return a sentence about a change that the tracker tells: it knows no cause of an offset."""
-    if change.kind == "view":
-        return f"{describe_change(change)}."
-    when = "later" if change.late_frames > 0.0 else "earlier"
-    return (
-        f"camera {change.camera}: near frame {change.frame} its people cease to meet those of the "
-        f"others, and then do {abs(change.late_frames):.0f} match frames {when}: its clock steps "
-        "or drifts. worldpose synchronize proposes offsets that change with it."
-    )
 
 
 def _doubts(

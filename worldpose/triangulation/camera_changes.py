@@ -410,6 +410,12 @@ def describe_change(change: CameraChange) -> str:
             f"camera {camera}: {what} within the clip{near}, in a way that no knock and no single "
             f"drift explains{left}"
         )
+    if change.kind == "clock" and change.std is None:  # people tell no cause of such an offset
+        return (
+            f"camera {camera}: near frame {change.frame} its people cease to meet those of the "
+            f"others, and then do {abs(late):.0f} match frames {when}: its clock steps or drifts. "
+            f"{todo}"
+        )
     if change.kind == "clock" and change.frame is not None:
         return (
             f"camera {camera}: its images are {abs(late):.1f} match frames {when} from frame "

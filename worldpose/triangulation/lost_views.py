@@ -135,7 +135,7 @@ class _Meetings:
         if abs(late) < 3 and np.linalg.norm(shift) < 0.5 * self._reach(chosen):
             return None
         amount = np.zeros(WIDTH)
-        amount[:2], amount[4] = shift, late
+        amount[:2], amount[4] = shift, self._finer_delay(chosen, late) if late else 0.0
         near = np.arange(
             max(0, rows[place] - 2 * second), min(len(self.seen), rows[place] + 2 * second)
         )
@@ -223,6 +223,20 @@ class _Meetings:
         met = np.array([self._met(rows, late=int(k)).sum() for k in delays])
         # People who move little meet at several delays.
         return int(np.median(delays[met >= 0.98 * met.max()]))
+
+    def _finer_delay(self, rows: Integers, late: int) -> float:
+        """Return the delay [frame] near a whole one with the least distances of those who meet.
+
+        With the motion u of their images in a frame, sum |x - pi(X(t + late)) - d u|^2 is least.
+        """
+        image, reach, inside = self._project(rows, late)
+        motion = 0.5 * (self._project(rows, late + 1)[0] - self._project(rows, late - 1)[0])
+        off = self.seen[rows][:, :, None] - image[:, None]
+        motion = np.broadcast_to(motion[:, None], off.shape)
+        near = inside[:, None] & (np.linalg.norm(off, axis=-1) < reach[:, None])
+        near &= np.isfinite(motion).all(axis=-1)
+        least = float((motion[near] ** 2).sum())
+        return late + float(np.clip((motion[near] * off[near]).sum() / max(least, 1e-9), -2.0, 2.0))
 
     def _best_shift(self, rows: Integers) -> Floats:
         """Return the shift (2,) [px] by which most detections meet people: six degrees at most."""
